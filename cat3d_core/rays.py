@@ -1,0 +1,86 @@
+"""Pixel rays, cones and raymaps."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from cat3d_core.cameras import Cameras
+
+
+class Rays(NamedTuple):
+    """origins (R, 3) and directions (R, 3) in the world; directions have z = 1 in their camera (not unit length), so
+    that a point at parameter t lies at z-depth t. radii (R, 1): radius of the pixel's cone at t = 1."""
+
+    origins: Tensor
+    directions: Tensor
+    radii: Tensor
+
+
+def pixel_rays(cameras: Cameras, view: Tensor, xy: Tensor) -> Rays:
+    """Rays through image points.
+
+    view (R,) int64: which camera; xy (R, 2): image coordinates in pixels (the centre of pixel (i, j) is i+0.5, j+0.5).
+    The cone radius follows mip-NeRF / Zip-NeRF: half the mean of the distances to the rays one pixel to the right and
+    one pixel down, times 2 / sqrt(12), so that the cone's variance is that of the pixel's footprint.
+    """
+    inverse_k = _inverse_intrinsics(cameras.intrinsics)[view]
+    rotation = cameras.rotation[view]
+    homogeneous = torch.cat([xy, torch.ones_like(xy[:, :1])], -1)
+    directions = (rotation @ (inverse_k @ homogeneous[..., None]))[..., 0]
+    # d(direction)/dx and /dy are the columns of R K^-1 (rotation keeps lengths, so K^-1 alone gives the norms).
+    step = inverse_k[:, :, :2].norm(dim=1).mean(-1, keepdim=True)
+    return Rays(cameras.centers[view], directions, step / 12**0.5)
+
+
+def image_rays(cameras: Cameras, view: int, width: int | None = None, height: int | None = None) -> Rays:
+    """Rays through all pixel centres of one camera, row by row; optionally at another resolution."""
+    camera = cameras[view]
+    if width is not None and height is not None:
+        camera = camera.resize(width, height)
+    width, height = (int(s) for s in camera.size[0])
+    y, x = torch.meshgrid(
+        torch.arange(height, device=camera.intrinsics.device) + 0.5,
+        torch.arange(width, device=camera.intrinsics.device) + 0.5,
+        indexing="ij",
+    )
+    xy = torch.stack([x, y], -1).reshape(-1, 2).to(camera.intrinsics)
+    return pixel_rays(camera, torch.zeros(len(xy), dtype=torch.long, device=xy.device), xy)
+
+
+def raymap(cameras: Cameras, relative_to: Tensor, height: int, width: int, plucker: bool = False) -> Tensor:
+    """(N, 6, height, width) ray of the centre of each latent cell, in the frame of the pose `relative_to` (4, 4).
+
+    Channels 0-2: ray origin, or with `plucker` the moment origin x direction (Pluecker coordinates are (d, o x d);
+    here the moment comes first so that both forms keep the direction in channels 3-5). Channels 3-5: unit direction.
+    Distances are in the cameras' world unit, so hand in normalised cameras (one similarity per scene). Being relative
+    to the first conditioning camera, the map does not change under rigid motions of the world (paper, 'Camera
+    conditioning'). Computed in float64, returned in the cameras' dtype.
+    """
+    dtype = cameras.intrinsics.dtype
+    cams = cameras.to(dtype=torch.float64).resize(width, height)
+    reference = relative_to.double()
+    to_reference = reference[:3, :3].T
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    grid = torch.stack([x, y, torch.ones_like(x)]).double().reshape(3, -1).to(reference.device)
+    directions = to_reference @ cams.rotation @ _inverse_intrinsics(cams.intrinsics) @ grid
+    directions = directions / directions.norm(dim=1, keepdim=True)
+    origins = (cams.centers - reference[:3, 3]) @ to_reference.T
+    first = origins[:, :, None].expand_as(directions)
+    if plucker:
+        first = torch.linalg.cross(first, directions, dim=1)
+    return torch.cat([first, directions], 1).reshape(len(cams), 6, height, width).to(dtype)
+
+
+def _inverse_intrinsics(k: Tensor) -> Tensor:
+    """Closed-form inverse of upper-triangular K (with skew): exact where a general inverse would round."""
+    fx, skew, cx = k[:, 0, 0], k[:, 0, 1], k[:, 0, 2]
+    fy, cy = k[:, 1, 1], k[:, 1, 2]
+    inverse = torch.zeros_like(k)
+    inverse[:, 0, 0], inverse[:, 1, 1], inverse[:, 2, 2] = 1 / fx, 1 / fy, 1
+    inverse[:, 0, 1] = -skew / (fx * fy)
+    inverse[:, 0, 2] = (skew * cy / fy - cx) / fx
+    inverse[:, 1, 2] = -cy / fy
+    return inverse
