@@ -23,8 +23,8 @@ def pixel_rays(cameras: Cameras, view: Tensor, xy: Tensor) -> Rays:
     """Rays through image points.
 
     view (R,) int64: which camera; xy (R, 2): image coordinates in pixels (the centre of pixel (i, j) is i+0.5, j+0.5).
-    The cone radius follows mip-NeRF / Zip-NeRF: half the mean of the distances to the rays one pixel to the right and
-    one pixel down, times 2 / sqrt(12), so that the cone's variance is that of the pixel's footprint.
+    The cone radius follows mip-NeRF / Zip-NeRF: the mean of the distances to the rays one pixel to the right and one
+    pixel down, times 2 / sqrt(12), so that the cone's variance is that of the pixel's footprint.
     """
     inverse_k = _inverse_intrinsics(cameras.intrinsics)[view]
     rotation = cameras.rotation[view]
@@ -32,7 +32,7 @@ def pixel_rays(cameras: Cameras, view: Tensor, xy: Tensor) -> Rays:
     directions = (rotation @ (inverse_k @ homogeneous[..., None]))[..., 0]
     # d(direction)/dx and /dy are the columns of R K^-1 (rotation keeps lengths, so K^-1 alone gives the norms).
     step = inverse_k[:, :, :2].norm(dim=1).mean(-1, keepdim=True)
-    return Rays(cameras.centers[view], directions, step / 12**0.5)
+    return Rays(cameras.centers[view], directions, step * 2 / 12**0.5)
 
 
 def image_rays(cameras: Cameras, view: int, width: int | None = None, height: int | None = None) -> Rays:

@@ -1,0 +1,30 @@
+# Two commands do everything on a machine with Python 3.11, g++ and make: `make demo` and `make test`.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+DEMO_OUT ?= outputs/demo
+DEMO_ARGS ?=
+
+.PHONY: demo test test-slow lint setup clean
+
+setup: $(VENV)/.installed
+
+# Re-made when the pins change; re-used otherwise.
+$(VENV)/.installed: pyproject.toml constraints.txt infra/setup.sh
+	PYTHON=$(PYTHON) VENV=$(VENV) sh infra/setup.sh
+	touch $@
+
+demo: setup
+	$(BIN)/cat3d demo --out $(DEMO_OUT) $(DEMO_ARGS)
+
+test: setup
+	OMP_NUM_THREADS=2 $(BIN)/python -m pytest -m "not slow" -q
+
+test-slow: setup
+	OMP_NUM_THREADS=2 $(BIN)/python -m pytest -m slow -q --timeout 1500
+
+lint: setup
+	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) outputs build *.egg-info
