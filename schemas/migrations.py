@@ -1,0 +1,56 @@
+"""Migrations of a scene store from one schema version to the next.
+
+Each is safe to be killed and run again: every step leaves what is already done alone, and the version is written last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from schemas.documents import read_group, write_group
+from schemas.errors import StoreError
+from schemas.layout import SCENE_STAGES, SCHEMA_VERSION, STAGES
+
+
+def _from_0(store: Path) -> None:
+    """Version 0, the design's draft, held one run at the root and had no records: it becomes the run "default"."""
+    run = store / "runs" / "default"
+    for folder in (store / "captured", store / "latents", store / "runs", store / "stages", run, run / "stages"):
+        if not (folder / "zarr.json").exists():
+            write_group(folder, {})
+    for name in ("plan", "generated", "field", "renders"):
+        if (store / name / "zarr.json").exists():
+            (store / name).rename(run / name)
+        elif not (run / name / "zarr.json").exists():
+            write_group(run / name, {})
+    for stage in STAGES:
+        if (store / "stages" / stage).exists() and stage not in SCENE_STAGES:
+            (store / "stages" / stage).rename(run / "stages" / stage)
+    attributes = read_group(store)
+    attributes.setdefault("dataset", "unknown")
+    attributes.setdefault("provenance", {})
+    similarity = attributes.pop("similarity", None)
+    if similarity is not None:
+        write_group(store / "captured", {**read_group(store / "captured"), "similarity": similarity})
+    write_group(store, {**attributes, "schema_version": 1})
+
+
+#: Version -> what brings a store of that version to the next.
+MIGRATIONS: dict[int, Callable[[Path], None]] = {0: _from_0}
+
+
+def migrate(store: Path) -> int:
+    """Bring the store at `store` to the present schema, step by step; returns the version it had.
+
+    Raises StoreError for a version newer than this code or one it has no way from.
+    """
+    first = version = int(read_group(store)["schema_version"])
+    if version > SCHEMA_VERSION:
+        raise StoreError(f"{store} has schema version {version}, newer than {SCHEMA_VERSION}: update cat3d.")
+    while version < SCHEMA_VERSION:
+        if version not in MIGRATIONS:
+            raise StoreError(f"{store} has schema version {version}, from which no migration leads on: make it again.")
+        MIGRATIONS[version](store)
+        version += 1
+    return first
