@@ -1,0 +1,120 @@
+"""Checkpoints: safetensors files that carry their configuration and provenance. No pickle."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from cat3d_core.diffusion.config import ModelConfig
+from cat3d_core.diffusion.model import MultiViewModel
+
+FORMAT = "cat3d.multiview.1"
+
+
+def weights_hash(state: dict[str, Tensor]) -> str:
+    """SHA-256 over names, dtypes, shapes and bytes, in the order of names: the same for equal weights in any file."""
+    digest = hashlib.sha256()
+    for name in sorted(state):
+        tensor = state[name].detach().cpu().contiguous()
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        digest.update(tensor.flatten().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
+
+
+def save_model(
+    path: str | Path, model: MultiViewModel, provenance: dict[str, Any], dtype: torch.dtype | None = None
+) -> str:
+    """Write U-Net, autoencoder, configuration and provenance (JSON values: data, steps, licence ...) to one file.
+
+    dtype: convert floating-point weights (torch.float16 to ship). Returns the weights' hash, which is also in the file.
+    The file appears under its name only when it is complete.
+    """
+    state = {
+        name: (t.to(dtype) if dtype and t.is_floating_point() else t).detach().cpu().contiguous().clone()
+        for name, t in model.state_dict().items()
+    }
+    if not all(torch.isfinite(t).all() for t in state.values()):
+        raise ValueError(f"The weights to be saved in {path} have values that are not finite (in {dtype or 'their dtype'}).")
+    digest = weights_hash(state)
+    metadata = {
+        "format": FORMAT,
+        "config": model.config.to_json(),
+        "provenance": json.dumps(provenance, sort_keys=True),
+        "sha256": digest,
+    }
+    _write(Path(path), state, metadata)
+    return digest
+
+
+def load_model(
+    path: str | Path, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32, check: bool = True
+) -> MultiViewModel:
+    """The model of a checkpoint, in eval mode. check: verify the weights against the hash in the file.
+
+    Raises ValueError if the file is not such a checkpoint, is damaged, or lacks weights; FileNotFoundError if absent.
+    """
+    metadata, state = _read(Path(path))
+    if metadata.get("format") != FORMAT:
+        raise ValueError(f"{path} is no cat3d model: its format is {metadata.get('format')!r}, expected {FORMAT!r}.")
+    if check and weights_hash(state) != metadata["sha256"]:
+        raise ValueError(f"{path} is damaged: its weights don't have the hash recorded in it. Fetch or export it again.")
+    with torch.device("meta"):
+        model = MultiViewModel(ModelConfig.from_json(metadata["config"]))
+    missing = sorted(set(model.state_dict()) ^ set(state))
+    if missing:
+        raise ValueError(f"{path} doesn't fit its configuration; weights missing or left over: {', '.join(missing[:5])}.")
+    model.load_state_dict({name: t.to(dtype) if t.is_floating_point() else t for name, t in state.items()}, assign=True)
+    return model.to(device).eval().requires_grad_(False)
+
+
+def describe(path: str | Path) -> dict[str, Any]:
+    """Configuration, provenance and hash of a model file, without loading its weights."""
+    metadata, _ = _read(Path(path), weights=False)
+    if metadata.get("format") != FORMAT:
+        raise ValueError(f"{path} is no cat3d model: its format is {metadata.get('format')!r}, expected {FORMAT!r}.")
+    return {
+        "config": json.loads(metadata["config"]),
+        "provenance": json.loads(metadata["provenance"]),
+        "sha256": metadata["sha256"],
+    }
+
+
+def save_state(path: str | Path, state: dict[str, Tensor], metadata: dict[str, Any]) -> None:
+    """Write tensors and JSON metadata (a trainer's state) to one file."""
+    _write(Path(path), {k: t.detach().cpu().contiguous() for k, t in state.items()}, {"state": json.dumps(metadata)})
+
+
+def load_state(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """What `save_state` wrote."""
+    metadata, state = _read(Path(path))
+    if "state" not in metadata:
+        raise ValueError(f"{path} is no saved training state.")
+    return state, json.loads(metadata["state"])
+
+
+def copy_weights(source: nn.Module, target: nn.Module) -> None:
+    """Copy parameters and buffers between two modules of one architecture, converting dtype and device."""
+    target.load_state_dict(source.state_dict())
+
+
+def _write(path: Path, state: dict[str, Tensor], metadata: dict[str, str]) -> None:
+    partial = path.with_name(path.name + ".partial")
+    save_file(state, partial, metadata)
+    partial.replace(path)
+
+
+def _read(path: Path, weights: bool = True) -> tuple[dict[str, str], dict[str, Tensor]]:
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no model file {path}.")
+    try:
+        with safe_open(path, "pt") as file:
+            return file.metadata() or {}, {k: file.get_tensor(k) for k in file.keys()} if weights else {}
+    except SafetensorError as error:
+        raise ValueError(f"{path} is not a readable safetensors file ({error}).") from error
