@@ -91,7 +91,7 @@ class Section:
         arrays.write(self.folder / name, values)
 
     def write_views(self, name: str, values: NDArray[Any], views: Sequence[int]) -> None:
-        """Write `values` (k, …) to the given k views of an array made by `create_array`. Safe beside other views' writers."""
+        """Write `values` (k, …) to k views of an array made by `create_array`. Safe beside writers of other views."""
         self._check_writable()
         arrays.write(self.folder / name, values, views)
 

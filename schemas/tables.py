@@ -1,0 +1,135 @@
+"""Tables of metrics and timings: Arrow schemas and Parquet folders that many processes append to, a file a writer.
+
+Read in one line: `duckdb.sql("select * from 'runs/metrics/*.parquet'")` or `pandas.read_parquet("runs/metrics")`.
+A value that doesn't apply or wasn't measured is null.
+"""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from schemas.documents import sync_folder
+from schemas.errors import StoreError
+from schemas.section import checked_name
+
+
+def _field(name: str, kind: pa.DataType, meaning: str, unit: str = "", required: bool = False) -> pa.Field:
+    return pa.field(name, kind, nullable=not required, metadata={"meaning": meaning, "unit": unit})
+
+
+_WHAT = (
+    _field("scene_id", pa.string(), "scene", required=True),
+    _field("dataset", pa.string(), "data set the scene belongs to"),
+    _field("run", pa.string(), "run of the scene: a split and a method"),
+    _field("method", pa.string(), "zipnerf, cat3d, or the name of an ablation"),
+    _field("split", pa.string(), "captured views trained on: 1, 3, 6, 9, all, or the name of a split file"),
+    _field("seed", pa.int64(), "seed of the run"),
+    _field("key", pa.string(), "content key of the stage that made the row", required=True),
+    _field("code_version", pa.string(), "version of the code that made the row"),
+)
+
+METRICS = pa.schema(
+    [
+        *_WHAT,
+        _field("protocol", pa.string(), "how the metrics are computed: google, regnerf, …", required=True),
+        _field("view", pa.int32(), "index of the captured view", required=True),
+        _field("view_name", pa.string(), "source name of the view"),
+        _field("width", pa.int32(), "width of the compared images", "px", required=True),
+        _field("height", pa.int32(), "height of the compared images", "px", required=True),
+        _field("psnr_db", pa.float64(), "peak signal-to-noise ratio, sRGB, peak 1", "dB"),
+        _field("ssim", pa.float64(), "structural similarity as the protocol defines it", "1"),
+        _field("lpips", pa.float64(), "perceptual distance by the named backbone", "1"),
+        _field("lpips_backbone", pa.string(), "network and weights of lpips"),
+        _field("clip_score", pa.float64(), "cosine of CLIP embeddings, render against source", "1"),
+        _field("depth_abs_rel", pa.float64(), "mean |z - z_true| / z_true where the truth is known", "1"),
+        _field("masked", pa.bool_(), "whether a mask was applied"),
+    ],
+    metadata={"format": "cat3d-metrics", "schema_version": "1", "row": "one rendered view under one protocol"},
+)
+
+TIMINGS = pa.schema(
+    [
+        *_WHAT,
+        _field("stage", pa.string(), "stage of the pipeline", required=True),
+        _field("started_at", pa.timestamp("us", "UTC"), "start", "s", required=True),
+        _field("seconds", pa.float64(), "wall time of the execution", "s", required=True),
+        _field("skipped", pa.bool_(), "the stage was complete already and did nothing"),
+        _field("views", pa.int64(), "views read or made", "1"),
+        _field("rays", pa.int64(), "rays cast", "1"),
+        _field("evaluations", pa.int64(), "evaluations of the network or field", "1"),
+        _field("steps", pa.int64(), "optimisation or sampler steps", "1"),
+        _field("bytes_written", pa.int64(), "bytes written to the store", "B"),
+        _field("peak_memory_bytes", pa.int64(), "largest resident or device memory", "B"),
+        _field("workers", pa.int32(), "processes that shared the work", "1"),
+        _field("device", pa.string(), "cpu, or the name of the accelerator"),
+        _field("host", pa.string(), "name of the machine"),
+    ],
+    metadata={"format": "cat3d-timings", "schema_version": "1", "row": "one execution of one stage"},
+)
+
+
+def append_rows(folder: str | Path, schema: pa.Schema, rows: Sequence[Mapping[str, Any]], name: str) -> Path:
+    """Write rows as `folder/name.parquet`, whole or not at all; returns the file.
+
+    The same name replaces the earlier file, so that a stage that runs again doesn't count twice: make the name of
+    what the rows describe. Raises StoreError for a column the schema doesn't have, a missing required value or a
+    wrong type.
+    """
+    folder = Path(folder)
+    path = folder / f"{checked_name(name)}.parquet"
+    for i, row in enumerate(rows):
+        unknown = sorted(set(row) - set(schema.names))
+        if unknown:
+            raise StoreError(f"Row {i} for {path} has the columns {unknown}, which the schema doesn't know.")
+        missing = [f.name for f in schema if not f.nullable and row.get(f.name) is None]
+        if missing:
+            raise StoreError(f"Row {i} for {path} has no value for {missing}, which every row needs.")
+    try:
+        table = pa.Table.from_pylist([dict(row) for row in rows], schema=schema)
+    except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
+        raise StoreError(f"The rows for {path} don't fit the schema: {error}.") from error
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = folder / f".{path.name}.{uuid.uuid4().hex}.partial"  # readers pass over names that start with a dot
+    try:
+        with temporary.open("wb") as file:
+            pq.write_table(table, file, compression="zstd", write_page_checksum=True)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise StoreError(f"Writing {path} failed: {error.strerror or error}.") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+    sync_folder(folder)
+    return path
+
+
+def read_rows(folder: str | Path, schema: pa.Schema | None = None) -> pa.Table:
+    """All rows of a folder, in the order of the files' names. Columns a file lacks are null, types are widened.
+
+    With `schema`, an empty or missing folder gives an empty table of it. Raises StoreError naming a damaged file.
+    """
+    folder = Path(folder)
+    tables = [_read_file(path) for path in sorted(folder.glob("[!._]*.parquet"))]
+    if not tables:
+        if schema is None:
+            raise StoreError(f"{folder} holds no tables.")
+        return schema.empty_table()
+    try:
+        return pa.concat_tables(tables, promote_options="permissive")
+    except pa.ArrowException as error:
+        raise StoreError(f"The tables in {folder} don't go together: {error}.") from error
+
+
+def _read_file(path: Path) -> pa.Table:
+    try:
+        return pq.ParquetFile(path, page_checksum_verification=True).read()
+    except (pa.ArrowException, OSError) as error:
+        raise StoreError(f"{path} is damaged: {error}. Remove it and evaluate again.") from error
