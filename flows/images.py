@@ -19,16 +19,17 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from flows.lens import distorted_pixels, filling_zoom
 from flows.readers.base import InputError
 
 MAX_PIXELS = 100_000_000
-EXTENSIONS = frozenset("jpg jpeg png webp tif tiff bmp exr hdr jp2 jxl ppm pgm tga gif".split())
+EXTENSIONS = frozenset(
+    ["jpg", "jpeg", "png", "webp", "tif", "tiff", "bmp", "exr", "hdr", "jp2", "jxl", "ppm", "pgm", "tga", "gif"]
+)
 UNSUPPORTED = {
-    **dict.fromkeys("heic heif avif".split(), "HEIC/AVIF"),
-    **dict.fromkeys("cr2 cr3 nef arw dng raf orf rw2".split(), "camera RAW"),
+    **dict.fromkeys(["heic", "heif", "avif"], "HEIC/AVIF"),
+    **dict.fromkeys(["cr2", "cr3", "nef", "arw", "dng", "raf", "orf", "rw2"], "camera RAW"),
 }
-# The largest factor by which undistortion may change the focal length before the coefficients are called implausible.
-MAX_ZOOM = 3.0
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -127,29 +128,14 @@ def resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return _from_planes(out, image.ndim)
 
 
-def distort(xy: Tensor, distortion: Tensor) -> Tensor:
-    """Normalised image coordinates (..., 2), x = X/Z, to where the lens puts them; OpenCV's model.
-
-    distortion (5): k1, k2, p1, p2, k3. With r2 = x^2 + y^2: x (1 + k1 r2 + k2 r2^2 + k3 r2^3) + 2 p1 x y + p2 (r2 + 2 x^2),
-    and the same for y with p1 and p2 exchanged.
-    """
-    k1, k2, p1, p2, k3 = distortion.to(xy).unbind(-1)
-    x, y = xy.unbind(-1)
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return torch.stack(
-        [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1
-    )
-
-
 def undistort(
     image: np.ndarray, intrinsics: Tensor, distortion: Tensor, nearest: bool = False
 ) -> tuple[np.ndarray, Tensor]:
     """The image a pinhole camera would have taken: same size, and its intrinsics (3, 3) float64.
 
-    image (H, W, C) or (H, W) uint8; intrinsics (3, 3) of this image; distortion (5) as in `distort`. Size and principal
-    point stay; one zoom of the focal lengths is chosen as the smallest with no pixel outside the photo, so there is no
-    black border and nearly the whole view stays. Own inverse warp: cubic sampling (`nearest` for masks).
+    image (H, W, C) or (H, W) uint8; intrinsics (3, 3) of this image; distortion (5) as in `lens.distort`. Size and
+    principal point stay; one zoom of the focal lengths is chosen as the smallest with no pixel outside the photo, so
+    there is no black border and nearly the whole view stays. Own inverse warp: cubic sampling (`nearest` for masks).
     Raises InputError where no moderate zoom does it (coefficients that no lens has).
     """
     intrinsics = intrinsics.double()
@@ -157,9 +143,9 @@ def undistort(
         return image, intrinsics
     height, width = image.shape[:2]
     new = intrinsics.clone()
-    new[0, 0], new[1, 1] = intrinsics[[0, 1], [0, 1]] * _filling_zoom(intrinsics, distortion, width, height)
+    new[0, 0], new[1, 1] = intrinsics[[0, 1], [0, 1]] * filling_zoom(intrinsics, distortion, width, height)
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    source = _source_pixels(torch.stack([columns, rows], -1).double(), new, intrinsics, distortion)
+    source = distorted_pixels(torch.stack([columns, rows], -1).double(), new, intrinsics, distortion)
     grid = (
         2 * source / torch.tensor([width, height]) - 1
     ).float()  # grid_sample without align_corners: -1..1 is the area
@@ -282,39 +268,6 @@ def _planes(image: np.ndarray) -> Tensor:
 def _from_planes(planes: Tensor, ndim: int) -> np.ndarray:
     image = (planes[0].clamp(0, 255) + 0.5).to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
     return image[..., 0] if ndim == 2 else image
-
-
-def _source_pixels(pixels: Tensor, new: Tensor, old: Tensor, distortion: Tensor) -> Tensor:
-    """Where in the distorted photo the pixel positions (..., 2) of the undistorted image come from."""
-    focal, center = new[[0, 1], [0, 1]], new[:2, 2]
-    return distort((pixels - center) / focal, distortion) * old[[0, 1], [0, 1]] + old[:2, 2]
-
-
-def _filling_zoom(intrinsics: Tensor, distortion: Tensor, width: int, height: int) -> float:
-    """The smallest zoom of the focal lengths for which the image's border comes from inside the photo."""
-    t = torch.linspace(0, 1, 257, dtype=torch.float64)
-    sides = [torch.stack([t, 0 * t], -1), torch.stack([t, 0 * t + 1], -1), torch.stack([0 * t, t], -1)]
-    size = torch.tensor([width, height], dtype=torch.float64)
-    border = torch.cat([*sides, torch.stack([0 * t + 1, t], -1)]) * size
-
-    def fills(zoom: float) -> bool:
-        new = intrinsics.clone()
-        new[0, 0], new[1, 1] = intrinsics[0, 0] * zoom, intrinsics[1, 1] * zoom
-        source = _source_pixels(border, new, intrinsics, distortion)
-        # Beyond a lens's fold the model turns back inwards: such a border would come from inside, but wrongly.
-        outward = ((source - intrinsics[:2, 2]) * (border - intrinsics[:2, 2])).sum(-1) >= 0
-        return bool(((source >= -1e-6) & (source <= size + 1e-6)).all() and outward.all())
-
-    low, high = 1 / MAX_ZOOM, MAX_ZOOM
-    if not fills(high):
-        raise InputError(
-            f"The lens distortion {[round(float(d), 4) for d in distortion]} is implausible for an image of {width} x "
-            f"{height} pixels: no zoom up to {MAX_ZOOM:g} makes a pinhole image of it; correct the coefficients."
-        )
-    for _ in range(40):
-        middle = (low + high) / 2
-        low, high = (low, middle) if fills(middle) else (middle, high)
-    return high
 
 
 def _write(path: Path, pixels: np.ndarray, attributes: dict[str, Any]) -> None:

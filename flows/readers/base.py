@@ -49,7 +49,8 @@ class Capture:
     and turned upright by its EXIF orientation, before undistortion. None where the poses must be estimated.
     distortion (N, 5): k1, k2, p1, p2, k3 in OpenCV's order and meaning, or None where there is none.
     masks (N): image files, white = object, or None per view. points (P, 3): sparse scene points, world frame.
-    depth_bounds (N, 2): near and far z-depth in world units. dataset: the family, which chooses splits and trajectories.
+    depth_bounds (N, 2): near and far z-depth in world units. dataset: the family, which chooses
+    splits and trajectories. depths (N arrays (H, W) float32): true z-depth, inf for the sky, in procedural scenes.
     splits: {"3": {"train": [indices], "test": [indices]}, ..., "all": {...}}; indices into names.
     missing: frames that the data set lists and the folder lacks. notes: sentences about what was assumed or changed.
     """
@@ -64,6 +65,7 @@ class Capture:
     masks: list[Path | None] = field(default_factory=list)
     points: Tensor | None = None
     depth_bounds: Tensor | None = None
+    depths: list[np.ndarray] | None = None
     splits: dict[str, dict[str, list[int]]] = field(default_factory=dict)
     missing: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -181,6 +183,7 @@ def inside(root: Path, name: str, source: Path | str) -> Path:
     target = root / relative
     if not target.resolve().is_relative_to(root.resolve()):
         raise InputError(
-            f'{source} names the file "{name}", which a symbolic link leads out of {root}; copy the file into the folder.'
+            f"{source} names the file '{name}', which a symbolic link leads out of {root}; "
+            "copy the file into the folder."
         )
     return target

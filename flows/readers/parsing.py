@@ -16,7 +16,9 @@ from flows.readers.base import InputError
 
 # Image and calibration may differ in aspect by rounding (3118 x 2078 -> 800 x 533), not by a crop or a turn.
 ASPECT_TOLERANCE = 0.02
-MIPNERF360_SCENES = frozenset("bicycle bonsai counter flowers garden kitchen room stump treehill".split())
+MIPNERF360_SCENES = frozenset(
+    ["bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill"]
+)
 # Scene names that tell the family where the layout doesn't.
 FAMILY_NAMES = {
     "mipnerf360": "mipnerf360",
@@ -130,8 +132,8 @@ def cameras_for_files(
             )
         if abs((w / h) / (w0 / h0) - 1) > ASPECT_TOLERANCE:
             raise InputError(
-                f"{source}: view {name} is calibrated for {w0:g} x {h0:g} pixels, but its image, upright, is {w} x {h}; "
-                "another aspect ratio (a crop, or a turn by EXIF orientation) cannot be made up for."
+                f"{source}: view {name} is calibrated for {w0:g} x {h0:g} pixels, but its image, upright, is "
+                f"{w} x {h}; another aspect ratio (a crop, or a turn by EXIF orientation) cannot be made up for."
             )
     factors = size.double() / calibrated_size.double()
     if (factors - 1).abs().max() > 1e-9:

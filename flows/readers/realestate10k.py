@@ -38,7 +38,8 @@ def read(path: Path, image_folder: str | None, view_counts: tuple[int, ...]) -> 
     missing = [str(t) for t in sorted(listed) if t not in files]
     if not times:
         raise InputError(
-            f"None of the {len(listed)} timestamps of {source} (first: {rows[0][0]:.0f}) is the name of an image in {folder}."
+            f"None of the {len(listed)} timestamps of {source} (first: {rows[0][0]:.0f}) is the name of an "
+            f"image in {folder}."
         )
     table = torch.tensor([listed[t] for t in times], dtype=torch.float64)
     paths = [files[t] for t in times]

@@ -23,7 +23,7 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, image_folder: str | None, view_counts: tuple[int, ...]) -> Capture:
-    """Few-view splits come from the files only; "all" holds out the test views of the file with the most training views."""
+    """Few-view splits come from the files only; "all" holds out the test views of the largest."""
     files = _split_files(path)
     if not files:
         raise InputError(f"{path} has no train_test_split_N.json; use the reader transforms for it.")

@@ -22,7 +22,7 @@ def linspace_ids(ids: Sequence[int], count: int) -> list[int]:
 
 
 def held_out(count: int, test: Sequence[int], view_counts: Sequence[int]) -> Splits:
-    """Splits with these test views, and for each view count (where there are enough) a linspace over the other views."""
+    """Splits with these test views, and a linspace over the other views for each count up to theirs."""
     rest = [i for i in range(count) if i not in set(test)]
     splits = {str(k): {"train": linspace_ids(rest, k), "test": list(test)} for k in view_counts if k <= len(rest)}
     return splits | {"all": {"train": rest, "test": list(test)}}

@@ -132,7 +132,7 @@ def _read_synthetic(path: Path, parts: list[str], view_counts: tuple[int, ...]) 
     few = {str(k): splits.linspace_ids(train, k) for k in view_counts if k <= len(train)}
     capture.splits = {name: {"train": ids, "test": test} for name, ids in (few | {"all": train}).items()}
     capture.notes.append(
-        "Split rule: test views are transforms_test.json's; training views are a rounded linspace over transforms_train.json's."
+        "Split rule: test views are those of transforms_test.json, training views a rounded linspace over the others."
     )
     return capture
 
