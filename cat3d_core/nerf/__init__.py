@@ -1,0 +1,9 @@
+"""Robust Zip-NeRF reconstruction of captured and generated views."""
+
+from cat3d_core.nerf.config import PRESETS, ReconstructConfig
+from cat3d_core.nerf.field import Field
+from cat3d_core.nerf.render import Render, render_image
+from cat3d_core.nerf.trainer import NonFiniteError, Trainer
+from cat3d_core.nerf.views import Views
+
+__all__ = ["PRESETS", "Field", "NonFiniteError", "ReconstructConfig", "Render", "Trainer", "Views", "render_image"]

@@ -1,0 +1,152 @@
+"""Settings of the reconstruction, each with where its value comes from, and the presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+
+@dataclass(frozen=True)
+class ReconstructConfig:
+    """Robust Zip-NeRF. Defaults are the paper's few-view set-up (CAT3D app. 'Details of 3D Reconstruction').
+
+    Lengths are in normalised scene units (mean camera distance about 1). 'Unstated' marks a value that neither CAT3D nor
+    Zip-NeRF gives for this setting: ours, recorded here so that it can be ablated.
+    Raises ValueError for settings that contradict each other.
+    """
+
+    # Optimisation
+    iterations: int = 1000
+    """CAT3D: 1,000. (Dense Zip-NeRF: 25,000.)"""
+    batch_rays: int = 2**20
+    """CAT3D: 1M few-view, 65k single image. Rounded to whole patches."""
+    chunk_rays: int = 2**14
+    """Rays differentiated at a time; gradients add up over the batch. Memory only, apart from the order of random draws."""
+    lr_init: float = 0.04
+    lr_final: float = 0.001
+    """CAT3D: logarithmic decay from lr_init to lr_final."""
+    warmup_iterations: int = 100
+    """Unstated; Zip-NeRF warms up over a tenth of its training (sine, from warmup_scale)."""
+    warmup_scale: float = 1e-8
+    adam_beta1: float = 0.9
+    adam_beta2: float = 0.99
+    adam_eps: float = 1e-15
+    """Zip-NeRF. A tiny eps is what lets the weight decay reach entries that no ray touches."""
+    max_skipped_steps: int = 10
+    """Non-finite steps are skipped and counted; more than this many stop the training."""
+
+    # Loss
+    charbonnier_eps: float = 1e-3
+    lpips_weight: float = 0.25
+    """CAT3D: 0.25 (single image, RealEstate10K, LLFF, DTU) or 1.0 (CO3D, mip-NeRF 360)."""
+    patch_size: int = 128
+    """CAT3D: 128 few-view, 32 single image. Used where a perceptual distance is given; else pixels are drawn singly."""
+    patch_share: float = 1.0
+    """Share of the rays drawn in patches, the rest singly. CAT3D: all. Less mixes views better when batches are small."""
+    interlevel_weight: float = 0.01
+    interlevel_blur: tuple[float, ...] = (0.03, 0.003)
+    distortion_weight: float = 0.01
+    distortion_power: float = -0.25
+    distortion_premult: float = 1e4
+    """Zip-NeRF 360: distortion of power_ladder(t, -0.25, 1e4)."""
+    weight_decay: float = 0.1
+    """Zip-NeRF: 0.1 * 0.5 * mean(v^2) of each grid level, summed over levels; applied in the optimiser."""
+
+    # Trust in generated views
+    distance_falloff: float = 15.0
+    """CAT3D: the weight of a generated view is exp(-b s^2), b annealed linearly from 0 to this."""
+    distance_unit: float = 1.0
+    """Unstated unit of s, the distance of camera centres to the nearest captured one: here normalised scene units."""
+    generated_weight_final: float = 0.5
+    """Unstated: CAT3D anneals generated views globally; here their weight falls linearly from 1 to this."""
+    captured_share: float = 0.1
+    """Unstated: at least this share of patches and pixels comes from captured views (uniform over views where that gives more)."""
+
+    # Rays
+    near: float = 0.0
+    far: float = 1e6
+    distance_power: float = -1.5
+    distance_premult: float = 2.0
+    """Zip-NeRF 360: power ladder of ray distance."""
+    samples: tuple[int, ...] = (64, 64, 32)
+    """Intervals per round; the last belongs to the radiance field, the others to the proposals."""
+    multisamples: int = 6
+    anneal_slope: float = 10.0
+    background: tuple[float, float] = (0.0, 1.0)
+    """Grey level behind the scene: uniform per ray in training, the mean in renderings."""
+
+    # Field
+    grid_base: int = 16
+    grid_max: tuple[int, ...] = (512, 2048, 8192)
+    grid_features: tuple[int, ...] = (1, 1, 4)
+    grid_log2_table: int = 21
+    grid_init: float = 1e-5
+    grid_gain: float = 10.0
+    """Zip-NeRF code: features are 10x the stored values ('preconditioning')."""
+    density_bias: float = -1.0
+    density_width: int = 64
+    bottleneck_width: int = 256
+    """Unstated for the few-view set-up; Zip-NeRF: 256."""
+    view_width: int = 32
+    view_depth: int = 1
+    """CAT3D: view network of width 32 and depth 1. (Dense Zip-NeRF: 256, 3.)"""
+    view_degree: int = 4
+    rgb_padding: float = 1e-3
+
+    # Speed (measured in `cat3d bench reconstruct`)
+    proposal_every: int = 1
+    """Train the proposals at every k-th step (after warm-up); 1 as in Zip-NeRF."""
+    low_resolution_iterations: int = 0
+    """Start on images of half the size for this many steps."""
+    plateau_patience: int = 0
+    """Stop once the loss of held-out pixels has not improved for this many checks; 0 never."""
+    plateau_every: int = 50
+
+    def __post_init__(self) -> None:
+        rounds = len(self.samples)
+        if rounds < 1 or len(self.grid_max) != rounds or len(self.grid_features) != rounds:
+            raise ValueError("samples, grid_max and grid_features need one entry per sampling round.")
+        if len(self.interlevel_blur) < rounds - 1:
+            raise ValueError(f"interlevel_blur needs an entry for each of the {rounds - 1} proposal rounds.")
+        if self.iterations < 1 or self.batch_rays < 1 or self.chunk_rays < 1 or min(self.samples) < 2:
+            raise ValueError("iterations, batch_rays and chunk_rays are at least 1, samples at least 2 per round.")
+        if not 0.0 <= self.patch_share <= 1.0 or not 0.0 <= self.captured_share <= 1.0:
+            raise ValueError("patch_share and captured_share lie in [0, 1].")
+        if not 0.0 < self.lr_final <= self.lr_init:
+            raise ValueError("The learning rate falls: 0 < lr_final <= lr_init.")
+        if self.proposal_every < 1 or self.plateau_every < 1:
+            raise ValueError("proposal_every and plateau_every are at least 1.")
+
+    @property
+    def rounds(self) -> int:
+        return len(self.samples)
+
+
+_PAPER = ReconstructConfig()
+
+# Smaller grids and images for two CPU cores: a scene in seconds (tiny), one to three minutes (fast) or about ten (balanced).
+_FAST = replace(
+    _PAPER,
+    batch_rays=2048,
+    chunk_rays=2048,
+    patch_size=32,
+    patch_share=0.5,
+    samples=(32, 24, 16),
+    grid_max=(128, 256, 1024),
+    grid_features=(1, 1, 4),
+    grid_log2_table=16,
+    bottleneck_width=16,
+    multisamples=6,
+)
+
+PRESETS: dict[str, ReconstructConfig] = {
+    "tiny": replace(
+        _FAST, iterations=100, warmup_iterations=10, batch_rays=512, chunk_rays=512, patch_size=16,
+        samples=(16, 12), grid_max=(64, 128), grid_features=(1, 4), interlevel_blur=(0.03,), grid_log2_table=14, multisamples=3,
+    ),
+    "fast": _FAST,
+    "balanced": replace(
+        _FAST, iterations=2500, warmup_iterations=250, batch_rays=4096, chunk_rays=4096, samples=(48, 48, 24),
+        grid_max=(256, 512, 2048), grid_log2_table=18,
+    ),
+    "paper": _PAPER,
+}  # fmt: skip

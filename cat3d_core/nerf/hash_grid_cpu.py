@@ -1,0 +1,133 @@
+"""The fused hash grid query as a small C++ kernel, compiled by g++ on first use and called through ctypes."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import platform
+import subprocess
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from cat3d_core.nerf.hash_grid import GridLayout
+
+_SOURCE = Path(__file__).with_name("hash_grid.cpp")
+_FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fopenmp", "-shared", "-fPIC", "-std=c++17")
+
+
+def _processor() -> str:
+    """What -march=native depends on, so that a cache on a shared disk serves unlike machines."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return "\n".join(sorted({line for line in lines if line.startswith(("model name", "flags"))}))
+    except OSError:
+        return platform.processor()
+
+
+def _compile() -> Path:
+    """Path of the shared library for this source and processor, compiled where the cache lacks it."""
+    compiler = os.environ.get("CXX", "g++")
+    key = hashlib.sha256(_SOURCE.read_bytes() + repr((compiler, _FLAGS, _processor())).encode()).hexdigest()[:24]
+    folder = Path(os.environ.get("CAT3D_CACHE") or Path.home() / ".cache" / "cat3d")
+    library = folder / f"hash_grid-{key}.so"
+    if not library.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            built = Path(scratch) / library.name
+            subprocess.run([compiler, *_FLAGS, str(_SOURCE), "-o", str(built)], check=True, capture_output=True, text=True)
+            os.replace(built, library)  # atomic: another process sees all of it or nothing
+    return library
+
+
+@functools.cache
+def _load() -> ctypes.CDLL | None:
+    try:
+        library = ctypes.CDLL(str(_compile()))
+    except (OSError, subprocess.CalledProcessError) as error:
+        detail = getattr(error, "stderr", None) or error
+        warnings.warn(
+            f"The CPU hash grid kernel could not be compiled, so the plain torch reference runs (over 20x slower): {detail}. "
+            "Install g++ with OpenMP, or name a compiler in CXX.",
+            stacklevel=2,
+        )
+        return None
+    library.hash_grid.restype = ctypes.c_int
+    return library
+
+
+def available() -> bool:
+    """Whether the kernel is there; compiles it at the first call and warns once where that fails."""
+    return _load() is not None
+
+
+@functools.cache
+def _levels(layout: GridLayout) -> Any:
+    rows = [
+        (layout.offsets[level], n, layout.offsets[level + 1] - layout.offsets[level], int(layout.hashed(level)))
+        for level, n in enumerate(layout.resolutions)
+    ]
+    flat = [value for row in rows for value in row]
+    return (ctypes.c_int64 * len(flat))(*flat)
+
+
+def _pointer(tensor: Tensor | None) -> ctypes.c_void_p:
+    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
+
+
+def _call(
+    backward: bool, source: Tensor, positions: Tensor, std: Tensor, out: Tensor, weights: Tensor | None, layout: GridLayout
+) -> None:
+    library = _load()
+    assert library is not None
+    status = library.hash_grid(
+        ctypes.c_int(backward), _pointer(source), _pointer(positions), _pointer(std), _pointer(out), _pointer(weights),
+        _levels(layout), ctypes.c_int(layout.levels), ctypes.c_int(layout.features),
+        ctypes.c_int64(std.shape[0]), ctypes.c_int(std.shape[1]), ctypes.c_int(torch.get_num_threads()),
+    )  # fmt: skip
+    if status:
+        raise ValueError(
+            f"The CPU kernel has 1, 2, 4 or 8 features and up to 6 samples and 32 levels, not {layout.features} features, "
+            f"{std.shape[1]} samples and {layout.levels} levels."
+        )
+
+
+class _Query(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> tuple[Tensor, Tensor]:
+        table, positions, std = table.contiguous(), positions.contiguous(), std.contiguous()
+        features = table.new_empty((std.shape[0], layout.levels, layout.features))
+        weights = table.new_empty((std.shape[0], layout.levels))
+        _call(False, table, positions, std, features, weights, layout)
+        ctx.save_for_backward(positions, std)
+        ctx.layout = layout
+        ctx.mark_non_differentiable(weights)
+        return features, weights
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor, _: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[override]
+        positions, std = ctx.saved_tensors
+        table_gradient = gradient.new_zeros((ctx.layout.rows, ctx.layout.features))
+        _call(True, gradient.contiguous(), positions, std, table_gradient, None, ctx.layout)
+        return table_gradient, None, None, None
+
+
+def query(table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> tuple[Tensor, Tensor]:
+    """As `hash_grid.query_reference` for float32 CPU tensors; deterministic, gradient for the table only.
+
+    Raises ValueError for shapes that do not fit the layout (the kernel itself checks nothing).
+    """
+    if table.shape != (layout.rows, layout.features) or positions.shape != (*std.shape, 3) or std.ndim != 2:
+        raise ValueError(
+            f"Expected table {(layout.rows, layout.features)}, positions (N, S, 3) and std (N, S); got {tuple(table.shape)}, "
+            f"{tuple(positions.shape)}, {tuple(std.shape)}."
+        )
+    if any(tensor.dtype != torch.float32 or tensor.device.type != "cpu" for tensor in (table, positions, std)):
+        raise ValueError("The CPU hash grid kernel takes float32 tensors on the CPU.")
+    return _Query.apply(table, positions.detach(), std.detach(), layout)  # type: ignore[no-any-return]

@@ -1,0 +1,192 @@
+"""Training of one field from posed views, deterministic and resumable."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+
+import torch
+from torch import Tensor
+
+from cat3d_core.nerf import losses
+from cat3d_core.nerf.adam import Adam
+from cat3d_core.nerf.config import ReconstructConfig
+from cat3d_core.nerf.field import Field
+from cat3d_core.nerf.render import render_rays
+from cat3d_core.nerf.views import Batch, Views, draw_batch
+from cat3d_core.random import derive_seed
+from cat3d_core.rays import pixel_rays
+
+Perceptual = Callable[[Tensor, Tensor], Tensor]
+
+
+class NonFiniteError(ValueError):
+    """Training met more non-finite steps than its config allows; the message names the views and pixels of the last one."""
+
+
+class Trainer:
+    """Robust Zip-NeRF training (CAT3D sec. 'Robust 3D reconstruction').
+
+    perceptual: optional (pred (B, 3, h, w) in [0, 1], target) -> distances (B,); without it no patches are drawn. The
+    random numbers of an iteration depend on (seed, iteration) alone, so that a run continued from `state` goes on exactly
+    as if it had never stopped; on the CPU the same seed and number of threads give the identical field.
+    """
+
+    def __init__(
+        self,
+        config: ReconstructConfig,
+        views: Views,
+        seed: int,
+        device: torch.device | str = "cpu",
+        perceptual: Perceptual | None = None,
+    ) -> None:
+        self.config, self.seed, self.perceptual = config, seed, perceptual
+        self.device = torch.device(device)
+        self.views = views.to(self.device)
+        self._coarse = views.halved().to(self.device) if config.low_resolution_iterations else None
+        self.field = Field(config, seed).to(self.device)
+        parameters = dict(self.field.named_parameters())
+        decay = {
+            f"grids.{index}.table": [(first, last, config.weight_decay) for first, last in grid.level_rows()]  # type: ignore[operator]
+            for index, grid in enumerate(self.field.grids)
+        }
+        self.adam = Adam(parameters, decay, config.adam_beta1, config.adam_beta2, config.adam_eps)
+        self.iteration = 0
+        self.skipped = 0
+
+    def learning_rate(self, iteration: int) -> float:
+        """Logarithmic decay times Zip-NeRF's sine warm-up."""
+        c = self.config
+        progress = min(1.0, iteration / c.iterations)
+        lr = math.exp((1.0 - progress) * math.log(c.lr_init) + progress * math.log(c.lr_final))
+        if iteration < c.warmup_iterations:
+            lr *= c.warmup_scale + (1.0 - c.warmup_scale) * math.sin(0.5 * math.pi * iteration / c.warmup_iterations)
+        return lr
+
+    def step(self) -> dict[str, float]:
+        """One iteration: loss terms, psnr of the batch, learning rate, and how many steps were skipped so far.
+
+        A step whose loss or gradient is not finite changes nothing but the count. Raises NonFiniteError after more than
+        `max_skipped_steps` of them, ValueError for views smaller than a patch.
+        """
+        c = self.config
+        progress = self.iteration / c.iterations
+        generator = torch.Generator(self.device).manual_seed(derive_seed(self.seed, "nerf", "step", self.iteration))
+        views = self._coarse if self._coarse is not None and self.iteration < c.low_resolution_iterations else self.views
+        trust = losses.view_weights(views.cameras.centers, views.captured, c, progress)
+        for parameter in self.adam.parameters.values():
+            parameter.grad = None
+        totals: dict[str, Tensor] = {}
+        batches = self._draw(views, generator)
+        for batch, share in self._chunks(batches):
+            terms = self._losses(views, batch, trust, progress, share, generator)
+            torch.stack([value for name, value in terms.items() if name != "mse"]).sum().backward()
+            for name, value in terms.items():
+                totals[name] = totals.get(name, torch.zeros_like(value)) + value.detach()
+        lr = self.learning_rate(self.iteration)
+        if self._finite(totals):
+            self.adam.step(lr)
+        else:
+            self._skip(views, batches, totals)
+        self.iteration += 1
+        result = {name: float(value) for name, value in totals.items()}
+        mse = result.pop("mse")
+        psnr = -10.0 * math.log10(mse) if 0.0 < mse < math.inf else math.nan
+        return {**result, "loss": sum(result.values()), "psnr": psnr, "lr": lr, "skipped": float(self.skipped)}
+
+    def _draw(self, views: Views, generator: torch.Generator) -> list[Batch]:
+        c = self.config
+        patches = 0
+        if self.perceptual is not None and c.lpips_weight > 0.0 and c.patch_share > 0.0:
+            patches = max(1, round(c.patch_share * c.batch_rays / c.patch_size**2))
+        singles = max(0, c.batch_rays - patches * c.patch_size**2) if c.patch_share < 1.0 or not patches else 0
+        batches = []
+        if patches:
+            batches.append(draw_batch(views, patches, c.patch_size, c.captured_share, generator))
+        if singles:
+            batches.append(draw_batch(views, singles, 1, c.captured_share, generator))
+        return batches
+
+    def _chunks(self, batches: list[Batch]) -> Iterator[tuple[Batch, dict[str, float]]]:
+        """Pieces of at most chunk_rays rays (or one patch), with their share of all rays and of all patches."""
+        total = sum(len(batch.view) for batch in batches)
+        for batch in batches:
+            area = batch.patch**2
+            size = max(1, self.config.chunk_rays // area) * area
+            for first in range(0, len(batch.view), size):
+                part = slice(first, first + size)
+                piece = Batch(batch.view[part], batch.xy[part], batch.rgb[part], batch.valid[part], batch.patch)
+                yield piece, {"rays": len(piece.view) / total, "patches": len(piece.view) / len(batch.view)}
+
+    def _losses(
+        self, views: Views, batch: Batch, trust: Tensor, progress: float, share: dict[str, float], generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        c = self.config
+        rays = pixel_rays(views.cameras, batch.view, batch.xy + 0.5)
+        anneal = c.anneal_slope * progress / ((c.anneal_slope - 1.0) * progress + 1.0)
+        proposals = self.iteration < c.warmup_iterations or self.iteration % c.proposal_every == 0
+        out = render_rays(self.field, rays, anneal, generator, proposals)
+        weight = trust[batch.view] * batch.valid
+        difference = out.rgb - batch.rgb
+        photometric = (losses.charbonnier(difference, c.charbonnier_eps).mean(-1) * weight).mean()
+        terms = {
+            "photometric": photometric * share["rays"],
+            "distortion": c.distortion_weight * losses.distortion(out.rounds[-1], c) * share["rays"],
+            "mse": (difference.detach().square().mean(-1) * batch.valid).mean() * share["rays"],
+        }
+        if proposals:
+            inter = losses.interlevel(out.rounds[:-1], out.rounds[-1], c.interlevel_blur)
+            terms["interlevel"] = c.interlevel_weight * inter * share["rays"]
+        if batch.patch > 1 and self.perceptual is not None:
+            shape = (-1, batch.patch, batch.patch, 3)
+            valid = batch.valid[:, None]
+            prediction, target = (
+                (image * valid).view(shape).permute(0, 3, 1, 2).contiguous() for image in (out.rgb, batch.rgb)
+            )
+            distance = self.perceptual(prediction.clamp(0.0, 1.0), target)
+            terms["perceptual"] = c.lpips_weight * (distance * trust[batch.view[:: batch.patch**2]]).mean() * share["patches"]
+        return terms
+
+    def _finite(self, totals: dict[str, Tensor]) -> bool:
+        gradients = [p.grad.abs().max() for p in self.adam.parameters.values() if p.grad is not None]
+        return bool(torch.isfinite(torch.stack([*totals.values(), *gradients])).all())
+
+    @torch.no_grad()
+    def _skip(self, views: Views, batches: list[Batch], totals: dict[str, Tensor]) -> None:
+        self.skipped += 1
+        if self.skipped <= self.config.max_skipped_steps:
+            return
+        culprits = []
+        for batch in batches:
+            rgb = render_rays(self.field, pixel_rays(views.cameras, batch.view, batch.xy + 0.5)).rgb
+            bad = (~torch.isfinite(rgb).all(-1) | ~torch.isfinite(batch.rgb).all(-1)).nonzero()[:8, 0]
+            culprits += [f"view {int(batch.view[i])} pixel {batch.xy[i].tolist()}" for i in bad]
+        terms = ", ".join(f"{name}={float(value):g}" for name, value in totals.items())
+        gradients = [n for n, p in self.adam.parameters.items() if p.grad is not None and not torch.isfinite(p.grad).all()]
+        raise NonFiniteError(
+            f"{self.skipped} training steps up to iteration {self.iteration} had a non-finite loss or gradient ({terms}; gradients of "
+            f"{', '.join(gradients) or 'no parameter'}). Rays that render non-finite colours: {'; '.join(culprits) or 'none'}; "
+            f"views of this batch: {sorted({int(v) for batch in batches for v in batch.view.unique()})}. "
+            "Check these views' cameras and images, or lower lr_init."
+        )
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything an exact continuation needs, as flat named tensors (safetensors-friendly, copies)."""
+        state = {f"field.{name}": value for name, value in self.field.state_dict().items()}
+        state |= {f"adam.{name}": value for name, value in self.adam.state().items()}
+        state |= {"trainer.iteration": torch.tensor(self.iteration), "trainer.skipped": torch.tensor(self.skipped)}
+        return {name: value.detach().cpu().clone() for name, value in state.items()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Continue from `state()`. Raises ValueError where it does not fit the config."""
+        own = self.state()
+        for name, value in own.items():
+            if name not in state or state[name].shape != value.shape:
+                found = tuple(state[name].shape) if name in state else "missing"
+                raise ValueError(
+                    f"The training state does not fit this config: {name} is {found}, expected {tuple(value.shape)}. "
+                    "Start the reconstruction anew, or use the config that made the state."
+                )
+        self.field.load_state_dict({n.removeprefix("field."): v for n, v in state.items() if n.startswith("field.")})
+        self.adam.load_state({n.removeprefix("adam."): v for n, v in state.items() if n.startswith("adam.")})
+        self.iteration, self.skipped = int(state["trainer.iteration"]), int(state["trainer.skipped"])
