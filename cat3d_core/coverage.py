@@ -1,0 +1,98 @@
+"""How well a set of views sees the scene's volume: a voxel grid of viewing directions.
+
+Definition. The volume is a cube about the scene's centre, upright, with a side of 1.5 times the mean distance of the
+captured cameras; where scene points are known, only the voxels that hold some of them (and their neighbours) count,
+else all of them. A voxel is seen by a view when its middle projects into the image at positive depth; there is no
+occlusion test (sparse points cannot give one). Directions from voxel to camera are sorted into 128 bins (18 degrees
+wide), the nearest of 128 Fibonacci-sphere directions fixed to the scene's axes. A (voxel, bin) pair is covered when
+some view sees the voxel from that bin. So the measure moves with the world and has no unit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from cat3d_core.cameras import Cameras
+from cat3d_core.trajectories.frame import SceneFrame
+
+BINS = 128
+_SIDE = 1.5
+_NONE = -1
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Numbers of one set of views: seen, the fraction of voxels that any view sees; directions, the mean number of
+    the 128 direction bins a voxel is seen from (over all voxels)."""
+
+    seen: float
+    directions: float
+
+
+def voxel_grid(frame: SceneFrame, points: Tensor | None = None, resolution: int = 12) -> Tensor:
+    """(K, 3) world middles of the voxels that count, in fixed order. See the module for the definition."""
+    step = _SIDE / resolution
+    axis = (torch.arange(resolution, dtype=torch.float64) + 0.5) * step - _SIDE / 2
+    local = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    if points is not None and len(points):
+        cell = ((frame.local(points.to(frame.center)) + _SIDE / 2) / step).floor().long()
+        cell = cell[((cell >= 0) & (cell < resolution)).all(-1)]
+        occupied = torch.zeros((resolution,) * 3)
+        occupied[tuple(cell.T)] = 1
+        near = torch.nn.functional.max_pool3d(occupied[None, None], 3, stride=1, padding=1)[0, 0]
+        if near.any():
+            local = local[near.reshape(-1) > 0]
+    return frame.center + frame.distance * local @ frame.axes
+
+
+def direction_bins(cameras: Cameras, frame: SceneFrame, voxels: Tensor) -> Tensor:
+    """(N, K) int64: the bin that view n sees voxel k from, or -1 where it does not see it."""
+    sphere = fibonacci_sphere(BINS).to(voxels)
+    out = []
+    for i in range(0, len(cameras), 32):
+        some = cameras[slice(i, i + 32)]
+        pixels, depth = some.project(voxels)
+        seen = (depth > 0) & (pixels >= 0).all(-1) & (pixels <= some.size[:, None].to(pixels)).all(-1)
+        toward = (some.centers[:, None] - voxels[None]) @ frame.axes.T
+        out.append(torch.where(seen, (toward @ sphere.T).argmax(-1), _NONE))
+    return torch.cat(out) if out else torch.zeros(0, len(voxels), dtype=torch.long)
+
+
+def fibonacci_sphere(count: int) -> Tensor:
+    """(count, 3) nearly even unit directions (golden-angle spiral)."""
+    i = torch.arange(count, dtype=torch.float64)
+    z = 1 - (2 * i + 1) / count
+    angle = torch.pi * (3 - 5**0.5) * i
+    r = (1 - z * z).sqrt()
+    return torch.stack([r * angle.cos(), r * angle.sin(), z], -1)
+
+
+def coverage(bins: Tensor) -> Coverage:
+    """Coverage of views given their bins (N, K)."""
+    covered = _covered(bins)
+    return Coverage(float(covered.any(-1).double().mean()), float(covered.sum(-1).double().mean()))
+
+
+def gains(bins: Tensor, given: Tensor | None = None) -> Tensor:
+    """(N,) how many (voxel, bin) pairs each view adds to those before it in order and to `given` (G, K)."""
+    covered = _covered(given) if given is not None else torch.zeros(bins.shape[1], BINS, dtype=torch.bool)
+    added = []
+    voxel = torch.arange(bins.shape[1])
+    for row in bins:
+        k = voxel[row >= 0]
+        b = row[row >= 0]
+        added.append(int((~covered[k, b]).sum()))
+        covered[k, b] = True
+    return torch.tensor(added, dtype=torch.long)
+
+
+def _covered(bins: Tensor) -> Tensor:
+    """(K, BINS) which pairs any of the views covers."""
+    out = torch.zeros(bins.shape[1], BINS + 1, dtype=torch.bool)
+    voxel = torch.arange(bins.shape[1])
+    for row in bins:
+        out[voxel, row] = True  # -1 is the spare last column
+    return out[:, :BINS]
