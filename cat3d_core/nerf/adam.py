@@ -10,13 +10,18 @@ from torch.optim.adam import adam
 class Adam:
     """torch's fused Adam over named float32 parameters, with decay 0.5 * c * mean(v^2) on named groups of rows.
 
-    decay: parameter name -> list of (first row, last row, c): its gradient c * v / count is added in float32 here, not by
-    autograd over all tables (on an 8M-entry level it is 1e-13, lost in half precision). Adam is invariant to the scale
-    of gradients, so even these pull untouched entries to zero at full speed; eps must stay tiny and steps dense.
+    decay: parameter name -> list of (first row, last row, c): its gradient c * v / count is added in float32 here, not
+    by autograd over all tables (on an 8M-entry level it is 1e-13, lost in half precision). Adam is invariant to the
+    scale of gradients, so even these pull untouched entries to zero at full speed; eps must stay tiny and steps dense.
     """
 
     def __init__(
-        self, parameters: dict[str, Tensor], decay: dict[str, list[tuple[int, int, float]]], beta1: float, beta2: float, eps: float
+        self,
+        parameters: dict[str, Tensor],
+        decay: dict[str, list[tuple[int, int, float]]],
+        beta1: float,
+        beta2: float,
+        eps: float,
     ) -> None:
         self.parameters = parameters
         self.decay = decay

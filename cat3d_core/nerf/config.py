@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 class ReconstructConfig:
     """Robust Zip-NeRF. Defaults are the paper's few-view set-up (CAT3D app. 'Details of 3D Reconstruction').
 
-    Lengths are in normalised scene units (mean camera distance about 1). 'Unstated' marks a value that neither CAT3D nor
-    Zip-NeRF gives for this setting: ours, recorded here so that it can be ablated.
+    Lengths are in normalised scene units (mean camera distance about 1). 'Unstated' marks a value that neither CAT3D
+    nor Zip-NeRF gives for this setting: ours, recorded here so that it can be ablated.
     Raises ValueError for settings that contradict each other.
     """
 
@@ -20,7 +20,8 @@ class ReconstructConfig:
     batch_rays: int = 2**20
     """CAT3D: 1M few-view, 65k single image. Rounded to whole patches."""
     chunk_rays: int = 2**14
-    """Rays differentiated at a time; gradients add up over the batch. Memory only, apart from the order of random draws."""
+    """Rays differentiated at a time; gradients add up over the batch. Memory only, apart from the order of random
+    draws."""
     lr_init: float = 0.04
     lr_final: float = 0.001
     """CAT3D: logarithmic decay from lr_init to lr_final."""
@@ -41,7 +42,8 @@ class ReconstructConfig:
     patch_size: int = 128
     """CAT3D: 128 few-view, 32 single image. Used where a perceptual distance is given; else pixels are drawn singly."""
     patch_share: float = 1.0
-    """Share of the rays drawn in patches, the rest singly. CAT3D: all. Less mixes views better when batches are small."""
+    """Share of the rays drawn in patches, the rest singly. CAT3D: all. Less mixes views better when batches are
+    small."""
     interlevel_weight: float = 0.01
     interlevel_blur: tuple[float, ...] = (0.03, 0.003)
     distortion_weight: float = 0.01
@@ -59,7 +61,8 @@ class ReconstructConfig:
     generated_weight_final: float = 0.5
     """Unstated: CAT3D anneals generated views globally; here their weight falls linearly from 1 to this."""
     captured_share: float = 0.1
-    """Unstated: at least this share of patches and pixels comes from captured views (uniform over views where that gives more)."""
+    """Unstated: at least this share of patches and pixels comes from captured views (uniform over views where that
+    gives more)."""
 
     # Rays
     near: float = 0.0
@@ -123,7 +126,8 @@ class ReconstructConfig:
 
 _PAPER = ReconstructConfig()
 
-# Smaller grids and images for two CPU cores: a scene in seconds (tiny), one to three minutes (fast) or about ten (balanced).
+# Smaller grids and images for two CPU cores: a scene in seconds (tiny), one to three minutes (fast) or about ten
+# (balanced).
 _FAST = replace(
     _PAPER,
     batch_rays=2048,
@@ -141,7 +145,8 @@ _FAST = replace(
 PRESETS: dict[str, ReconstructConfig] = {
     "tiny": replace(
         _FAST, iterations=100, warmup_iterations=10, batch_rays=512, chunk_rays=512, patch_size=16,
-        samples=(16, 12), grid_max=(64, 128), grid_features=(1, 4), interlevel_blur=(0.03,), grid_log2_table=14, multisamples=3,
+        samples=(16, 12), grid_max=(64, 128), grid_features=(1, 4), interlevel_blur=(0.03,), grid_log2_table=14,
+        multisamples=3,
     ),
     "fast": _FAST,
     "balanced": replace(

@@ -1,4 +1,5 @@
-"""Coordinates of the field: contraction of unbounded space and warping of ray distance (Zip-NeRF section 2, supplement).
+"""Coordinates of the field: contraction of unbounded space and warping of ray distance (Zip-NeRF section 2,
+supplement).
 
 `t` is distance along a ray in normalised scene units (z-depth: ray directions have camera z = 1); `s` in [0, 1] is the
 warped distance in which intervals are sampled. All functions are differentiable and finite over every float32
@@ -14,7 +15,8 @@ from torch import Tensor
 
 
 def contract(x: Tensor) -> Tensor:
-    """Contract points (..., 3) of the whole space into the ball of radius 2 (mip-NeRF 360 eq. 10); identity for |x| <= 1.
+    """Contract points (..., 3) of the whole space into the ball of radius 2 (mip-NeRF 360 eq. 10); identity for |x| <=
+    1.
 
     |x|^2 is clamped to at least 1 before the root, so that value and gradient are exact inside the unit ball and no
     branch produces a NaN. Needs |x| below 1e19 in float32.
@@ -89,7 +91,8 @@ def t_from_s(s: Tensor, near: float, far: float, p: float = -1.5, premult: float
 
 
 def s_from_t(t: Tensor, near: float, far: float, p: float = -1.5, premult: float = 2.0) -> Tensor:
-    """Warped distance of t in [near, far]: (P(t) - P(near)) / (P(far) - P(near)) of the power ladder, without cancellation."""
+    """Warped distance of t in [near, far]: (P(t) - P(near)) / (P(far) - P(near)) of the power ladder, without
+    cancellation."""
     _check_range(near, far, p)
     if p == 1.0:
         return (t - near) / (far - near)

@@ -40,7 +40,9 @@ def safe_exp(x: Tensor) -> Tensor:
 
 def encode_directions(unit: Tensor, degree: int) -> Tensor:
     """Positional encoding (..., 3 + 6 degree) of unit directions (..., 3): identity, then sin and cos of 2^k d."""
-    scaled = (unit[..., None, :] * 2.0 ** torch.arange(degree, dtype=unit.dtype, device=unit.device)[:, None]).flatten(-2)
+    scaled = (unit[..., None, :] * 2.0 ** torch.arange(degree, dtype=unit.dtype, device=unit.device)[:, None]).flatten(
+        -2
+    )
     return torch.cat([unit, scaled.sin(), scaled.cos()], -1)
 
 
@@ -61,7 +63,8 @@ class GridDensity(nn.Module):
         return list(zip(self.layout.offsets[:-1], self.layout.offsets[1:], strict=True))
 
     def forward(self, means: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
-        """Cone samples (R, N, S, 3), (R, N, S) in the scene -> density (R, N) per scene unit, hidden units (R, N, width)."""
+        """Cone samples (R, N, S, 3), (R, N, S) in the scene -> density (R, N) per scene unit, hidden units (R, N,
+        width)."""
         rays, intervals, samples = std.shape
         # The contracted ball of radius 2 lies in the grid's cube [-2, 2]^3.
         positions = (contract(means) * 0.25 + 0.5).view(-1, samples, 3)
@@ -122,8 +125,13 @@ class Field(nn.Module):
 
     @classmethod
     def from_state(cls, config: ReconstructConfig, state: Mapping[str, Tensor]) -> Field:
-        """Field from `Trainer.state()` or its own state dict. Raises ValueError where names or shapes do not fit the config."""
-        own = {name.removeprefix("field."): value for name, value in state.items() if not name.startswith(("adam.", "trainer."))}
+        """Field from `Trainer.state()` or its own state dict. Raises ValueError where names or shapes do not fit the
+        config."""
+        own = {
+            name.removeprefix("field."): value
+            for name, value in state.items()
+            if not name.startswith(("adam.", "trainer."))
+        }
         field = cls(config)
         try:
             field.load_state_dict(own)

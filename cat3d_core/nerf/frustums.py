@@ -1,4 +1,5 @@
-"""Cone multisampling: each ray interval becomes a few isotropic Gaussians that match the frustum's moments (Zip-NeRF sec. 2)."""
+"""Cone multisampling: each ray interval becomes a few isotropic Gaussians that match the frustum's moments (Zip-NeRF
+sec. 2)."""
 
 from __future__ import annotations
 
@@ -7,7 +8,8 @@ import math
 import torch
 from torch import Tensor
 
-# Around the cone in an order that decorrelates angle from depth (Zip-NeRF's 'hexify'); three samples take every second one.
+# Around the cone in an order that decorrelates angle from depth (Zip-NeRF's 'hexify'); three samples take every second
+# one.
 _TURNS = {6: (0, 2, 4, 3, 5, 1), 3: (0, 2, 4)}
 
 
@@ -42,12 +44,18 @@ def sample_distances(t: Tensor, count: int = 6) -> Tensor:
 
 
 def cone_samples(
-    origins: Tensor, directions: Tensor, radii: Tensor, t: Tensor, count: int = 6, generator: torch.Generator | None = None
+    origins: Tensor,
+    directions: Tensor,
+    radii: Tensor,
+    t: Tensor,
+    count: int = 6,
+    generator: torch.Generator | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Gaussians that stand for the frusta of rays: means (R, N, count, 3) and standard deviations (R, N, count), scene units.
+    """Gaussians that stand for the frusta of rays: means (R, N, count, 3) and standard deviations (R, N, count), scene
+    units.
 
-    origins, directions (R, 3) (camera z = 1, not unit), radii (R, 1) of the cone at t = 1, edges t (R, N+1). Samples lie
-    on a spiral of radius r t / sqrt(2). With a generator (training) each interval's spiral is flipped and turned at
+    origins, directions (R, 3) (camera z = 1, not unit), radii (R, 1) of the cone at t = 1, edges t (R, N+1). Samples
+    lie on a spiral of radius r t / sqrt(2). With a generator (training) each interval's spiral is flipped and turned at
     random; without, every odd interval is flipped and turned by 30 degrees, so rendering is deterministic.
     Raises ValueError for a count other than 6 (the paper) or 3 (half the cost).
     """

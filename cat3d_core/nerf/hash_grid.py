@@ -52,7 +52,8 @@ def make_layout(base_resolution: int, max_resolution: int, log2_table: int, feat
 
 
 def level_weights(std: Tensor, resolution: int) -> Tensor:
-    """Down-weighting of a level of the given resolution for samples of this std: erf(1 / (sqrt 8 std n)) (Zip-NeRF eq. 5).
+    """Down-weighting of a level of the given resolution for samples of this std: erf(1 / (sqrt 8 std n)) (Zip-NeRF eq.
+    5).
 
     The clamp keeps std = 0 finite (weight 1); no gradient flows to std in training, and here it would be finite too.
     """
@@ -102,8 +103,8 @@ def query_reference(table: Tensor, positions: Tensor, std: Tensor, layout: GridL
 def query(table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> tuple[Tensor, Tensor]:
     """`query_reference` by the fastest kernel there is for the tensors' device and dtype; gradient for the table only.
 
-    float32 on the CPU: the C++ kernel where a compiler is found; float32 on CUDA: Triton where it is installed. Otherwise
-    the reference. All CPU paths are deterministic.
+    float32 on the CPU: the C++ kernel where a compiler is found; float32 on CUDA: Triton where it is installed.
+    Otherwise the reference. All CPU paths are deterministic.
     """
     if table.dtype == torch.float32:
         if table.device.type == "cpu":

@@ -41,7 +41,9 @@ def _compile() -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             built = Path(scratch) / library.name
-            subprocess.run([compiler, *_FLAGS, str(_SOURCE), "-o", str(built)], check=True, capture_output=True, text=True)
+            subprocess.run(
+                [compiler, *_FLAGS, str(_SOURCE), "-o", str(built)], check=True, capture_output=True, text=True
+            )
             os.replace(built, library)  # atomic: another process sees all of it or nothing
     return library
 
@@ -53,8 +55,8 @@ def _load() -> ctypes.CDLL | None:
     except (OSError, subprocess.CalledProcessError) as error:
         detail = getattr(error, "stderr", None) or error
         warnings.warn(
-            f"The CPU hash grid kernel could not be compiled, so the plain torch reference runs (over 20x slower): {detail}. "
-            "Install g++ with OpenMP, or name a compiler in CXX.",
+            f"The CPU hash grid kernel could not be compiled, so the plain torch reference runs (over 10x slower): "
+            f"{detail}. Install g++ with OpenMP, or name a compiler in CXX.",
             stacklevel=2,
         )
         return None
@@ -82,7 +84,13 @@ def _pointer(tensor: Tensor | None) -> ctypes.c_void_p:
 
 
 def _call(
-    backward: bool, source: Tensor, positions: Tensor, std: Tensor, out: Tensor, weights: Tensor | None, layout: GridLayout
+    backward: bool,
+    source: Tensor,
+    positions: Tensor,
+    std: Tensor,
+    out: Tensor,
+    weights: Tensor | None,
+    layout: GridLayout,
 ) -> None:
     library = _load()
     assert library is not None
@@ -93,8 +101,8 @@ def _call(
     )  # fmt: skip
     if status:
         raise ValueError(
-            f"The CPU kernel has 1, 2, 4 or 8 features and up to 6 samples and 32 levels, not {layout.features} features, "
-            f"{std.shape[1]} samples and {layout.levels} levels."
+            f"The CPU kernel has 1, 2, 4 or 8 features and up to 6 samples and 32 levels, not {layout.features} "
+            f"features, {std.shape[1]} samples and {layout.levels} levels."
         )
 
 
@@ -125,8 +133,8 @@ def query(table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> 
     """
     if table.shape != (layout.rows, layout.features) or positions.shape != (*std.shape, 3) or std.ndim != 2:
         raise ValueError(
-            f"Expected table {(layout.rows, layout.features)}, positions (N, S, 3) and std (N, S); got {tuple(table.shape)}, "
-            f"{tuple(positions.shape)}, {tuple(std.shape)}."
+            f"Expected table {(layout.rows, layout.features)}, positions (N, S, 3) and std (N, S); got "
+            f"{tuple(table.shape)}, {tuple(positions.shape)}, {tuple(std.shape)}."
         )
     if any(tensor.dtype != torch.float32 or tensor.device.type != "cpu" for tensor in (table, positions, std)):
         raise ValueError("The CPU hash grid kernel takes float32 tensors on the CPU.")

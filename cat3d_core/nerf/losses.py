@@ -17,10 +17,12 @@ def charbonnier(difference: Tensor, eps: float) -> Tensor:
 
 
 def interlevel(proposals: list[Round], final: Round, blur: tuple[float, ...]) -> Tensor:
-    """Spline inter-level loss (Zip-NeRF sec. 3): sum over proposals of mean(max(0, blurred w - proposal w)^2 / proposal w).
+    """Spline inter-level loss (Zip-NeRF sec. 3): sum over proposals of mean(max(0, blurred w - proposal w)^2 /
+    proposal w).
 
     The final histogram is a constant target; gradients flow to the proposals' weights only. eps keeps the denominator
-    from zero: the slope is below 1 / eps^2 = 7e13 for a missed surface, finite, and falls with the proposal's own weight.
+    from zero: the slope is below 1 / eps^2 = 7e13 for a missed surface, finite, and falls with the proposal's own
+    weight.
     """
     total = torch.zeros((), dtype=final.weights.dtype, device=final.weights.device)
     for proposal, halfwidth in zip(proposals, blur, strict=False):
@@ -39,8 +41,9 @@ def distortion(final: Round, config: ReconstructConfig) -> Tensor:
 def view_weights(centers: Tensor, captured: Tensor, config: ReconstructConfig, progress: float) -> Tensor:
     """Loss weight (N,) of each view at `progress` in [0, 1] through training (CAT3D app., 'Distance based weighting').
 
-    Captured views weigh 1; a generated view exp(-b s^2) * g with s the distance of its centre (N, 3, normalised units) to
-    the nearest captured one, b rising linearly from 0 to `distance_falloff`, g falling from 1 to `generated_weight_final`.
+    Captured views weigh 1; a generated view exp(-b s^2) * g with s the distance of its centre (N, 3, normalised units)
+    to the nearest captured one, b rising linearly from 0 to `distance_falloff`, g falling from 1 to
+    `generated_weight_final`.
     """
     if bool(captured.all()) or not bool(captured.any()):
         return torch.ones(len(centers), device=centers.device)

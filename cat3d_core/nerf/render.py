@@ -36,8 +36,9 @@ class RayRender:
 
 @dataclass(frozen=True)
 class Render:
-    """A rendered image: image (H, W, 3) in [0, 1]; depth (H, W) median and depth_mean (H, W) expected z-depth in normalised
-    scene units; opacity (H, W) in [0, 1]; normals (H, W, 3) unit, world frame, towards the camera, from the median depth."""
+    """A rendered image: image (H, W, 3) in [0, 1]; depth (H, W) median and depth_mean (H, W) expected z-depth in
+    normalised scene units; opacity (H, W) in [0, 1]; normals (H, W, 3) unit, world frame, towards the camera, from the
+    median depth."""
 
     image: Tensor
     depth: Tensor
@@ -57,7 +58,11 @@ def weights_from_density(density: Tensor, t: Tensor, directions: Tensor) -> Tens
 
 
 def render_rays(
-    field: Field, rays: Rays, anneal: float = 1.0, generator: torch.Generator | None = None, train_proposals: bool = True
+    field: Field,
+    rays: Rays,
+    anneal: float = 1.0,
+    generator: torch.Generator | None = None,
+    train_proposals: bool = True,
 ) -> RayRender:
     """Render rays. With a generator (training): jittered samples, random spirals and a random grey background per ray.
 
@@ -99,7 +104,8 @@ def expected_depth(final: Round) -> Tensor:
 
 
 def normals_from_depth(depth: Tensor, rays: Rays) -> Tensor:
-    """Unit normals (H, W, 3) in the world, towards the camera, of the surface of z-depth (H, W) seen along its rays (H*W).
+    """Unit normals (H, W, 3) in the world, towards the camera, of the surface of z-depth (H, W) seen along its rays
+    (H*W).
 
     Central differences of the back-projected points, the nearer neighbour at depth edges; 0 where they degenerate.
     """
@@ -133,8 +139,8 @@ def render_image(
 ) -> Render:
     """Render one camera (normalised scene) on the field's device, `chunk` rays at a time, at a scaled resolution.
 
-    The depth is z-depth in normalised scene units. `on_progress` is called with the finished share; an exception that it
-    raises stops the rendering. `config` defaults to the field's own, to which it must be equal in all but speed.
+    The depth is z-depth in normalised scene units. `on_progress` is called with the finished share; an exception that
+    it raises stops the rendering. `config` defaults to the field's own, to which it must be equal in all but speed.
     """
     device = field.colour.rgb.weight.device
     width, height = (max(1, round(float(side) * resolution_scale)) for side in cameras.size[view_index])

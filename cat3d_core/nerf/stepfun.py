@@ -22,7 +22,8 @@ def _cumulative(w: Tensor) -> Tensor:
 
 
 def _locate(knots: Tensor, query: Tensor) -> tuple[Tensor, Tensor]:
-    """Bin index of each query (last knot not above it) and offset in [0, 1] in that bin; 0 where the bin has no width."""
+    """Bin index of each query (last knot not above it) and offset in [0, 1] in that bin; 0 where the bin has no
+    width."""
     index = torch.searchsorted(knots, query.contiguous(), right=True).sub_(1).clamp_(0, knots.shape[-1] - 2)
     low = knots.gather(-1, index)
     width = knots.gather(-1, index + 1) - low
@@ -43,10 +44,11 @@ def invert_cdf(u: Tensor, t: Tensor, logits: Tensor) -> Tensor:
 
 
 def sample_intervals(t: Tensor, logits: Tensor, count: int, generator: torch.Generator | None = None) -> Tensor:
-    """Edges (..., count+1) in [0, 1] of intervals around `count` samples of softmax(logits) (mip-NeRF 360 sec. 3, camp).
+    """Edges (..., count+1) in [0, 1] of intervals around `count` samples of softmax(logits) (mip-NeRF 360 sec. 3,
+    camp).
 
-    With a generator all samples of a row share one uniform jitter (stratified); without they sit at bin centres. Interval
-    ends are the midpoints between samples, the first and last reflected.
+    With a generator all samples of a row share one uniform jitter (stratified); without they sit at bin centres.
+    Interval ends are the midpoints between samples, the first and last reflected.
     """
     eps = torch.finfo(t.dtype).eps
     if generator is None:
@@ -69,9 +71,10 @@ def sample_intervals(t: Tensor, logits: Tensor, count: int, generator: torch.Gen
 def blurred_resample(query: Tensor, t: Tensor, w: Tensor, halfwidth: float) -> Tensor:
     """Weight (..., m) in the bins of `query` (..., m+1) of the histogram (t, w) convolved with a box of 2 * halfwidth.
 
-    Zip-NeRF's spline inter-level target: the blurred histogram is piecewise linear, its integral F piecewise quadratic. With
-    G(x) the integral of the cumulative weight, F(x) = (G(x + h) - G(x - h)) / 2h, which needs one search per end and no
-    sort. The difference cancels in float32 (1e-5 of the total), so it is evaluated in float64; no gradient is wanted.
+    Zip-NeRF's spline inter-level target: the blurred histogram is piecewise linear, its integral F piecewise
+    quadratic. With G(x) the integral of the cumulative weight, F(x) = (G(x + h) - G(x - h)) / 2h, which needs one
+    search per end and no sort. The difference cancels in float32 (1e-5 of the total), so it is evaluated in float64;
+    no gradient is wanted.
     """
     with torch.no_grad():
         t64, w64, query64 = t.double(), w.double(), query.double()
@@ -91,7 +94,8 @@ def blurred_resample(query: Tensor, t: Tensor, w: Tensor, halfwidth: float) -> T
 
 
 def distortion(t: Tensor, w: Tensor) -> Tensor:
-    """Distortion (...) of histograms: sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 width_i (mip-NeRF 360 eq. 15), in O(n).
+    """Distortion (...) of histograms: sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 width_i (mip-NeRF 360 eq. 15), in
+    O(n).
 
     The double sum is written as 2 sum_k (m_{k+1} - m_k) W_k (W - W_k), W_k the weight up to bin k: every term is
     positive, so nothing cancels and the result is never negative.
@@ -104,7 +108,8 @@ def distortion(t: Tensor, w: Tensor) -> Tensor:
 
 
 def quantile(t: Tensor, w: Tensor, fraction: float) -> Tensor:
-    """Position (...) where the cumulative weight reaches `fraction` of its total; rows without weight give the last edge."""
+    """Position (...) where the cumulative weight reaches `fraction` of its total; rows without weight give the last
+    edge."""
     cumulative = _cumulative(w)
     total = cumulative[..., -1:]
     index, offset = _locate(cumulative, fraction * total)

@@ -21,15 +21,16 @@ Perceptual = Callable[[Tensor, Tensor], Tensor]
 
 
 class NonFiniteError(ValueError):
-    """Training met more non-finite steps than its config allows; the message names the views and pixels of the last one."""
+    """Training met more non-finite steps than its config allows; the message names the views and pixels of the last
+    one."""
 
 
 class Trainer:
     """Robust Zip-NeRF training (CAT3D sec. 'Robust 3D reconstruction').
 
     perceptual: optional (pred (B, 3, h, w) in [0, 1], target) -> distances (B,); without it no patches are drawn. The
-    random numbers of an iteration depend on (seed, iteration) alone, so that a run continued from `state` goes on exactly
-    as if it had never stopped; on the CPU the same seed and number of threads give the identical field.
+    random numbers of an iteration depend on (seed, iteration) alone, so that a run continued from `state` goes on
+    exactly as if it had never stopped; on the CPU the same seed and number of threads give the identical field.
     """
 
     def __init__(
@@ -72,7 +73,9 @@ class Trainer:
         c = self.config
         progress = self.iteration / c.iterations
         generator = torch.Generator(self.device).manual_seed(derive_seed(self.seed, "nerf", "step", self.iteration))
-        views = self._coarse if self._coarse is not None and self.iteration < c.low_resolution_iterations else self.views
+        views = (
+            self._coarse if self._coarse is not None and self.iteration < c.low_resolution_iterations else self.views
+        )
         trust = losses.view_weights(views.cameras.centers, views.captured, c, progress)
         for parameter in self.adam.parameters.values():
             parameter.grad = None
@@ -119,7 +122,13 @@ class Trainer:
                 yield piece, {"rays": len(piece.view) / total, "patches": len(piece.view) / len(batch.view)}
 
     def _losses(
-        self, views: Views, batch: Batch, trust: Tensor, progress: float, share: dict[str, float], generator: torch.Generator
+        self,
+        views: Views,
+        batch: Batch,
+        trust: Tensor,
+        progress: float,
+        share: dict[str, float],
+        generator: torch.Generator,
     ) -> dict[str, Tensor]:
         c = self.config
         rays = pixel_rays(views.cameras, batch.view, batch.xy + 0.5)
@@ -144,7 +153,9 @@ class Trainer:
                 (image * valid).view(shape).permute(0, 3, 1, 2).contiguous() for image in (out.rgb, batch.rgb)
             )
             distance = self.perceptual(prediction.clamp(0.0, 1.0), target)
-            terms["perceptual"] = c.lpips_weight * (distance * trust[batch.view[:: batch.patch**2]]).mean() * share["patches"]
+            terms["perceptual"] = (
+                c.lpips_weight * (distance * trust[batch.view[:: batch.patch**2]]).mean() * share["patches"]
+            )
         return terms
 
     def _finite(self, totals: dict[str, Tensor]) -> bool:
@@ -162,11 +173,14 @@ class Trainer:
             bad = (~torch.isfinite(rgb).all(-1) | ~torch.isfinite(batch.rgb).all(-1)).nonzero()[:8, 0]
             culprits += [f"view {int(batch.view[i])} pixel {batch.xy[i].tolist()}" for i in bad]
         terms = ", ".join(f"{name}={float(value):g}" for name, value in totals.items())
-        gradients = [n for n, p in self.adam.parameters.items() if p.grad is not None and not torch.isfinite(p.grad).all()]
+        gradients = [
+            n for n, p in self.adam.parameters.items() if p.grad is not None and not torch.isfinite(p.grad).all()
+        ]
+        drawn = sorted({int(view) for batch in batches for view in batch.view.unique()})
         raise NonFiniteError(
-            f"{self.skipped} training steps up to iteration {self.iteration} had a non-finite loss or gradient ({terms}; gradients of "
-            f"{', '.join(gradients) or 'no parameter'}). Rays that render non-finite colours: {'; '.join(culprits) or 'none'}; "
-            f"views of this batch: {sorted({int(v) for batch in batches for v in batch.view.unique()})}. "
+            f"{self.skipped} training steps up to iteration {self.iteration} had a non-finite loss or gradient "
+            f"({terms}; gradients of {', '.join(gradients) or 'no parameter'}). Rays that render non-finite colours: "
+            f"{'; '.join(culprits) or 'none'}; views of this batch: {drawn}. "
             "Check these views' cameras and images, or lower lr_init."
         )
 

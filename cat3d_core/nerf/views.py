@@ -25,8 +25,8 @@ class Views:
     ) -> None:
         if not len(images) == len(cameras) == len(captured) or not len(images):
             raise ValueError(
-                f"Reconstruction needs at least one view and as many images ({len(images)}) and captured flags ({len(captured)}) "
-                f"as cameras ({len(cameras)})."
+                f"Reconstruction needs at least one view and as many images ({len(images)}) and captured flags "
+                f"({len(captured)}) as cameras ({len(cameras)})."
             )
         if masks is not None and len(masks) != len(images):
             raise ValueError(f"There are {len(masks)} masks for {len(images)} images.")
@@ -34,11 +34,14 @@ class Views:
             width, height = cameras.size[index].tolist()
             if image.dtype != torch.uint8 or tuple(image.shape) != (height, width, 3):
                 raise ValueError(
-                    f"The image of view {index} is {image.dtype} {tuple(image.shape)}; its camera needs uint8 {(height, width, 3)}."
+                    f"The image of view {index} is {image.dtype} {tuple(image.shape)}; its camera needs uint8 "
+                    f"{(height, width, 3)}."
                 )
             mask = masks[index] if masks is not None else None
             if mask is not None and tuple(mask.shape) != (height, width):
-                raise ValueError(f"The mask of view {index} has shape {tuple(mask.shape)}; its image is {(height, width)}.")
+                raise ValueError(
+                    f"The mask of view {index} has shape {tuple(mask.shape)}; its image is {(height, width)}."
+                )
         self.cameras = cameras.to(dtype=torch.float32)
         self.captured = captured.to(torch.bool)
         self.size = cameras.size  # (N, 2) width, height
@@ -47,7 +50,10 @@ class Views:
         self.pixels = torch.cat([image.reshape(-1, 3) for image in images])
         self.valid = None
         if masks is not None:
-            whole = [torch.ones(image.shape[:2], dtype=torch.bool) if m is None else m for image, m in zip(images, masks, strict=True)]
+            whole = [
+                torch.ones(image.shape[:2], dtype=torch.bool) if m is None else m
+                for image, m in zip(images, masks, strict=True)
+            ]
             self.valid = torch.cat([m.reshape(-1).to(torch.bool) for m in whole])
 
     def __len__(self) -> int:
@@ -69,12 +75,16 @@ class Views:
             if not width or not height:
                 raise ValueError(f"View {index} is too small to be halved; set low_resolution_iterations to 0.")
             span = slice(int(self.offset[index]), int(self.offset[index]) + int(self.size[index].prod()))
-            whole = self.pixels[span].view(int(self.size[index, 1]), int(self.size[index, 0]), 3)[: 2 * height, : 2 * width]
+            whole = self.pixels[span].view(int(self.size[index, 1]), int(self.size[index, 0]), 3)[
+                : 2 * height, : 2 * width
+            ]
             small = functional.avg_pool2d(whole.permute(2, 0, 1).float(), 2).round().to(torch.uint8)
             images.append(small.permute(1, 2, 0).contiguous())
             cameras.append(self.cameras[index].crop(0, 0, 2 * width, 2 * height).resize(width, height))
             if self.valid is not None:
-                valid = self.valid[span].view(int(self.size[index, 1]), int(self.size[index, 0]))[: 2 * height, : 2 * width]
+                valid = self.valid[span].view(int(self.size[index, 1]), int(self.size[index, 0]))[
+                    : 2 * height, : 2 * width
+                ]
                 masks.append(functional.avg_pool2d(valid[None].float(), 2)[0] == 1)
         return Views(Cameras.cat(cameras), images, self.captured, masks or None)
 
@@ -102,7 +112,9 @@ def _draw_views(views: Views, count: int, captured_share: float, generator: torc
     captured = views.captured.float()
     number = captured.sum()
     share = (number / len(captured)).clamp_min(captured_share) if 0 < number < len(captured) else number / len(captured)
-    probability = captured * share / number.clamp_min(1) + (1 - captured) * (1 - share) / (len(captured) - number).clamp_min(1)
+    probability = captured * share / number.clamp_min(1) + (1 - captured) * (1 - share) / (
+        len(captured) - number
+    ).clamp_min(1)
     return torch.multinomial(probability, count, replacement=True, generator=generator)
 
 
@@ -113,7 +125,9 @@ def draw_batch(views: Views, patches: int, patch: int, captured_share: float, ge
     """
     smallest = int(views.size.min())
     if patch > smallest:
-        raise ValueError(f"Patches of {patch} pixels do not fit a view whose shorter side is {smallest}; lower patch_size.")
+        raise ValueError(
+            f"Patches of {patch} pixels do not fit a view whose shorter side is {smallest}; lower patch_size."
+        )
     view = _draw_views(views, patches, captured_share, generator)
     room = views.size[view] - patch + 1
     corner = (torch.rand((patches, 2), generator=generator, device=view.device, dtype=torch.float64) * room).long()

@@ -1,0 +1,73 @@
+"""Cone samples against the moments of the conical frustum."""
+
+import math
+
+import pytest
+import torch
+
+from cat3d_core.nerf.frustums import cone_samples, perpendicular_basis, sample_distances
+
+
+@pytest.mark.parametrize("count", [3, 6])
+@pytest.mark.parametrize(("t0", "t1"), [(0.0, 1.0), (0.5, 0.6), (1.0, 1.0), (3.0, 100.0), (1e5, 1e6)])
+def test_moments_along_the_ray(count: int, t0: float, t1: float) -> None:
+    """Mean and variance of t for a cone of radius ~ t, mip-NeRF eq. 7: density proportional to t^2 on [t0, t1]."""
+    distances = sample_distances(torch.tensor([[t0, t1]], dtype=torch.float64), count)[0, 0]
+    if t1 == t0:
+        assert torch.equal(distances, torch.full((count,), t0, dtype=torch.float64))
+        return
+    moment = [(t1 ** (3 + k) - t0 ** (3 + k)) / (3 + k) for k in range(3)]
+    mean = moment[1] / moment[0]
+    assert distances.mean().item() == pytest.approx(mean, rel=1e-9)
+    assert distances.min() >= t0
+    assert distances.max() <= 1.04 * t1  # matching the moments of a cone from its apex reaches 3.3% beyond its base
+    variance = moment[2] / moment[0] - mean**2
+    # Zip-NeRF's spacing reproduces the variance exactly (checked here, not assumed).
+    assert distances.var(unbiased=False).item() == pytest.approx(variance, rel=1e-6)
+
+
+def test_moments_across_the_ray() -> None:
+    """Six samples reproduce the isotropic second moment of the frustum's cross-section: r^2 E[t^2] / 4 each way, their
+    share."""
+    t = torch.tensor([[1.0, 1.2]], dtype=torch.float64)
+    radius = 0.01
+    direction = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    means, std = cone_samples(
+        torch.zeros_like(direction), direction, torch.full((1, 1), radius, dtype=torch.float64), t
+    )
+    x, y, z = means[0, 0].unbind(-1)
+    assert x.mean().abs() < radius * 0.02
+    assert y.mean().abs() < radius * 0.02
+    expected = radius**2 * z.square().mean() / 4
+    assert x.square().mean().item() == pytest.approx(expected.item(), rel=0.05)
+    assert y.square().mean().item() == pytest.approx(expected.item(), rel=0.05)
+    torch.testing.assert_close(std[0, 0], 0.5 * radius * z / math.sqrt(2), rtol=1e-9, atol=0)
+
+
+def test_basis_is_orthonormal_for_every_direction() -> None:
+    generator = torch.Generator().manual_seed(0)
+    d = torch.randn((2000, 3), generator=generator)
+    special = torch.tensor(
+        [[0, 0, 1.0], [0, 0, -1], [1, 0, 0], [0, -1, 0], [1e-20, 0, -1], [0, 1e-9, 1], [3e-5, -2e-5, -7]]
+    )
+    d = torch.cat([d, special])
+    frame = torch.cat([perpendicular_basis(d), torch.nn.functional.normalize(d, dim=-1)[:, None]], 1)
+    torch.testing.assert_close(frame @ frame.transpose(1, 2), torch.eye(3).expand(len(d), 3, 3), rtol=0, atol=2e-6)
+
+
+def test_finite_at_the_camera_and_far_away_and_deterministic_without_generator() -> None:
+    t = torch.tensor([[0.0, 0.0, 1e-30, 1e-8, 1.0, 1e6, 1e6]])
+    ray = (torch.zeros(1, 3), torch.tensor([[0.1, 0.2, 1.0]]), torch.full((1, 1), 1e-3))
+    means, std = cone_samples(*ray, t)
+    again, _ = cone_samples(*ray, t)
+    assert torch.isfinite(means).all()
+    assert torch.isfinite(std).all()
+    assert (std >= 0).all()
+    assert torch.equal(means, again)
+    jittered, _ = cone_samples(*ray, t, 6, torch.Generator().manual_seed(1))
+    assert torch.isfinite(jittered).all()
+
+
+def test_other_counts_are_refused() -> None:
+    with pytest.raises(ValueError, match="6 or 3"):
+        cone_samples(torch.zeros(1, 3), torch.ones(1, 3), torch.ones(1, 1), torch.tensor([[0.0, 1.0]]), 4)
