@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal, NamedTuple
 
 import torch
@@ -44,6 +45,16 @@ def relative_raymaps(raymaps_world: Tensor, world_from_reference: Tensor) -> Ten
     return torch.cat(
         [torch.einsum("gij,gvihw->gvjhw", rotation, part) for part in (origins, raymaps_world[:, :, 3:])], 2
     )
+
+
+def ray_features(raymaps: Tensor, octaves: int) -> Tensor:
+    """[..., 6, h, w] -> [..., 6 (1 + 2 octaves), h, w]: the rays and sin, cos of 2^k pi / 2 times them, k < octaves (Fourier
+    features as in SRT's raymaps, Sajjadi et al. 2022, and 3DiM's). A dropped (zero) map keeps a pattern of its own."""
+    parts = [raymaps]
+    for octave in range(octaves):
+        angle = raymaps * (2**octave * math.pi / 2)
+        parts += [angle.sin(), angle.cos()]
+    return torch.cat(parts, -3)
 
 
 def camera_vectors(raymaps: Tensor) -> Tensor:

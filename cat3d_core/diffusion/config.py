@@ -35,6 +35,7 @@ class UNetConfig:
     (paper: 32); "temporal" adds a 1D attention over views at each place instead; "none" is the 2D network.
     decoder_only: views meet in the middle and the up path only.
     camera: "raymap" concatenates 6 ray channels; "vector" feeds 8 numbers per view through cross-attention.
+    ray_octaves: sines and cosines of the ray channels at this many octaves are concatenated too (0: the rays alone).
     """
 
     latent_channels: int = 8
@@ -50,6 +51,7 @@ class UNetConfig:
     decoder_only: bool = False
     camera: CameraInput = "raymap"
     cross_attention_dim: int = 1024
+    ray_octaves: int = 0
 
     def __post_init__(self) -> None:
         levels = len(self.channels)
@@ -64,7 +66,7 @@ class UNetConfig:
     @property
     def input_channels(self) -> int:
         """Latent, mask and (unless the camera enters as a vector) raymap channels."""
-        return self.latent_channels + 1 + (6 if self.camera == "raymap" else 0)
+        return self.latent_channels + 1 + (6 * (1 + 2 * self.ray_octaves) if self.camera == "raymap" else 0)
 
     def level_attention(self, level: int, decoder: bool) -> ViewAttention:
         """How views meet at this level."""

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from cat3d_core.diffusion.attention import SpatialTransformer, zero_
-from cat3d_core.diffusion.conditioning import camera_vectors
+from cat3d_core.diffusion.conditioning import camera_vectors, ray_features
 from cat3d_core.diffusion.config import UNetConfig, ViewAttention
 from cat3d_core.diffusion.layers import Downsample, ResnetBlock, TimeMLP, Upsample, time_embedding
 
@@ -68,7 +68,9 @@ class MultiViewUNet(nn.Module):
             raise ValueError(f"The latents have {channels} channels, this U-Net works on {self.config.latent_channels}.")
         dtype = self.conv_in.weight.dtype
         mask_map = mask.to(latents.dtype)[:, :, None, None, None].expand(-1, -1, 1, height, width)
-        parts = [latents, raymaps.to(latents.dtype), mask_map] if self.config.camera == "raymap" else [latents, mask_map]
+        parts = [latents, mask_map]
+        if self.config.camera == "raymap":
+            parts.insert(1, ray_features(raymaps.to(latents.dtype), self.config.ray_octaves))
         x = torch.cat(parts, 2).flatten(0, 1).to(dtype)
         context = None
         if self.config.camera == "vector":
