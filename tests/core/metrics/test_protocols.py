@@ -1,0 +1,157 @@
+"""Each protocol against the code it names, re-derived in float64 or run from the package, on real images."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from skimage.metrics import structural_similarity
+
+from cat3d_core.metrics.perceptual import PerceptualDistance
+from cat3d_core.metrics.protocols import PROTOCOLS, evaluate, evaluate_batch, quantize
+
+
+def psnr64(x, y):
+    return -10 * math.log10(((x.astype(np.float64) - y.astype(np.float64)) ** 2).mean())
+
+
+def check(result, psnr, ssim):
+    assert abs(result["psnr"] - psnr) < 1e-6
+    assert abs(result["ssim"] - ssim) < 1e-6
+
+
+@pytest.fixture
+def pair(real_pairs):
+    """A noisy photograph in float (not on the grid of 8 bits) and its clean one, 200x250."""
+    return real_pairs[0][0, :, 50:250, 100:350], real_pairs[1][0, :, 50:250, 100:350]
+
+
+def test_google(pair, reference):
+    x, y = (reference.numpy(i) for i in pair)
+    check(evaluate("google", *pair), psnr64(x, y), reference.ssim(x, y, reference.gaussian))
+
+
+@pytest.mark.parametrize(("name", "data_range"), [("regnerf", 2.0), ("freenerf", 1.0)])
+def test_regnerf_and_freenerf(pair, masked_pair, reference, name, data_range):
+    x, y = (reference.numpy(i) for i in pair)
+    check(evaluate(name, *pair), psnr64(x, y), structural_similarity(x, y, channel_axis=2, data_range=data_range))
+    prediction, target, mask = masked_pair
+    x, y, m = reference.numpy(prediction), reference.numpy(target), mask.numpy()[..., None].astype(np.float64)
+    inside = psnr64(x[mask.numpy()], y[mask.numpy()])
+    x, y = x * m + (1 - m), y * m + (1 - m)
+    similarity = structural_similarity(x, y, channel_axis=2, data_range=data_range)
+    check(evaluate(name, prediction, target, mask), inside, similarity)
+
+
+def test_soft_masks_as_regnerf_reads_them(pair, reference):
+    """PSNR where the mask is exactly 1; the composite with the fractions."""
+    mask = torch.linspace(0, 2, pair[0].shape[2]).clamp(max=1).expand(pair[0].shape[1:]).contiguous()
+    x, y = (reference.numpy(i) for i in pair)
+    m = mask.numpy()[..., None].astype(np.float64)
+    whole = (m == 1)[..., 0]
+    expected = structural_similarity(x * m + (1 - m), y * m + (1 - m), channel_axis=2, data_range=1.0)
+    check(evaluate("freenerf", *pair, mask), psnr64(x[whole], y[whole]), expected)
+
+
+def test_3dgs(pair, reference):
+    """From PNG files (torchvision's save_image adds a half and truncates), zero-padded window."""
+    x, y = (
+        np.floor(reference.numpy(i).astype(np.float32) * np.float32(255) + np.float32(0.5)).astype(np.uint8) / 255
+        for i in pair
+    )
+    check(evaluate("3dgs", *pair), psnr64(x, y), reference.ssim(x, y, reference.gaussian, pad=5))
+
+
+def test_nerfbaselines(pair, masked_pair, reference):
+    """convert_image_dtype truncates; masks blacken both images before every metric."""
+
+    def to_8_bits(image):
+        return (reference.numpy(image).astype(np.float32) * 255).clip(0, 255).astype(np.uint8) / 255
+
+    x, y = (to_8_bits(i) for i in pair)
+    check(evaluate("nerfbaselines", *pair), psnr64(x, y), reference.ssim(x, y, reference.gaussian))
+    prediction, target, mask = masked_pair
+    x, y = (to_8_bits(i) * mask.numpy()[..., None] for i in (prediction, target))
+    result = evaluate("nerfbaselines", prediction, target, mask)
+    check(result, psnr64(x, y), reference.ssim(x, y, reference.gaussian))
+
+
+def test_perceptual_column_is_named_after_what_was_measured_and_fed_its_range(pair):
+    distance = PerceptualDistance("lpips-squeeze")
+    prediction, target = (i[None] for i in pair)
+    with torch.no_grad():
+        scaled, raw = float(distance(prediction, target)), float(distance(prediction, target, normalize=False))
+    assert scaled != pytest.approx(raw, rel=1e-3)
+    for name, expected in (("google", scaled), ("freenerf", raw)):
+        result = evaluate(name, *pair, perceptual=distance)
+        assert sorted(result) == ["lpips-squeeze", "psnr", "ssim"]
+        assert result["lpips-squeeze"] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_identical_images(name):
+    image = torch.rand(3, 32, 32)
+    assert evaluate(name, image, image.clone()) == {"psnr": math.inf, "ssim": 1.0}
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_white_against_black(name):
+    result = evaluate(name, torch.ones(3, 32, 32), torch.zeros(3, 32, 32))
+    assert result["psnr"] == 0.0
+    assert 0 < result["ssim"] < 0.02 or name == "3dgs"
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_predictions_are_clamped_and_batches_are_views(name):
+    torch.manual_seed(0)
+    prediction, target = torch.randn(3, 3, 20, 24), torch.rand(3, 3, 20, 24)
+    rows = evaluate_batch(name, prediction, target)
+    assert rows == [evaluate(name, prediction[i].clamp(0, 1), target[i]) for i in range(3)]
+
+
+@pytest.mark.parametrize("how", ["round", "truncate"])
+def test_eight_bit_images_survive_quantisation(how):
+    image = torch.arange(256, dtype=torch.float32) / 255
+    assert torch.equal(quantize(image, how), image)
+
+
+@given(st.floats(0, 1, width=32))
+def test_quantisation_is_within_its_step(value):
+    x = torch.tensor([value])
+    assert abs(float(quantize(x, "round") - x)) <= 0.5 / 255 + 1e-7
+    assert -1e-7 <= float(x - quantize(x, "truncate")) <= 1 / 255 + 1e-7
+
+
+def image(value=0.5, size=(16, 16)):
+    return torch.full((3, *size), value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("psnr", image(), image()), "no metric protocol 'psnr'; choose one of google"),
+        (("google", image(), image(), torch.ones(16, 16)), "'google' defines no masked metrics; use one of regnerf"),
+        (("regnerf", image(), image(), torch.zeros(16, 16)), "mask selects no pixel"),
+        (("google", image(math.nan), image()), "prediction holds NaN"),
+        (("google", image(), image(math.inf)), "target holds NaN or infinite"),
+        (("google", image(), image(2.0)), r"target has values in \[2, 2\]"),
+        (("google", image(size=(1, 1)), image(size=(1, 1))), "at least 11x11 pixels; these images are 1x1"),
+        (("regnerf", image(size=(1, 4096)), image(size=(1, 4096))), "at least 7x7 pixels; these images are 4096x1"),
+        (("google", image()[None], image()[None]), "use evaluate_batch"),
+        (("google", image().to(torch.uint8), image()), "divide uint8 images by 255"),
+    ],
+)
+def test_errors_are_sentences(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        evaluate(*arguments)
+
+
+def test_batch_errors_name_the_view():
+    prediction = torch.rand(3, 3, 16, 16)
+    prediction[1, 0, 0, 0] = math.nan
+    with pytest.raises(ValueError, match="View 1: The prediction holds NaN"):
+        evaluate_batch("google", prediction, torch.rand(3, 3, 16, 16))
