@@ -12,14 +12,14 @@ def mean_squared_error(prediction: Tensor, target: Tensor, mask: Tensor | None =
     """Mean over pixels and channels of the squared difference: (B,) float64.
 
     prediction, target (B, C, H, W); mask (B, H, W) weighs the pixels (an empty mask gives NaN: nothing was measured).
+    Squares are float32 for float32 images (relative error about 1e-7; differences below 1e-22 count as none).
     """
     prediction, target, mask = image_pair(prediction, target, mask)
-    # In float64: in float32 squares of differences below 1e-19 vanish, and PSNR at 45 dB has an ulp of 4e-6.
-    squared = (prediction.double() - target.double()).square()
+    squared = (prediction - target).square()
     if mask is None:
-        return squared.mean(dim=(1, 2, 3))
+        return squared.mean(dim=(1, 2, 3)).double()
     weight = mask.double()
-    return (squared.mean(dim=1) * weight).sum(dim=(1, 2)) / weight.sum(dim=(1, 2))
+    return (squared.mean(dim=1).double() * weight).sum(dim=(1, 2)) / weight.sum(dim=(1, 2))
 
 
 def psnr(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:

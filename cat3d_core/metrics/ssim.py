@@ -41,6 +41,9 @@ class Window:
         return count / (count - 1) if self.bessel else 1.0
 
 
+_CHUNK = 1 << 20  # values of a batch that are worked on at a time
+
+
 def _gaussian_taps(count: int = 11, sigma: float = 1.5) -> tuple[float, ...]:
     weights = [math.exp(-0.5 * ((i - count // 2) / sigma) ** 2) for i in range(count)]
     return tuple(w / sum(weights) for w in weights)
@@ -67,7 +70,7 @@ def _local_mean(images: Tensor, taps: tuple[float, ...]) -> Tensor:
         total = images.narrow(axis, half, length) * taps[half]
         for i in range(half):
             pair = images.narrow(axis, i, length) + images.narrow(axis, 2 * half - i, length)
-            total = torch.add(total, pair, alpha=taps[i])
+            total.add_(pair, alpha=taps[i])
         images = total
     return images
 
@@ -123,8 +126,12 @@ def ssim(
     prediction, target (B, C, H, W) in [0, data_range]; mask (B, H, W) weighs the windows by the pixel at their centre
     (no weight left gives NaN). Raises as `ssim_map`.
     """
-    _, _, mask = image_pair(prediction, target, mask)
-    local = ssim_map(prediction, target, window, data_range).mean(dim=1)
+    prediction, target, mask = image_pair(prediction, target, mask)
+    # Image by image where they are large: the working set then stays in the processor's cache.
+    images = max(1, _CHUNK // prediction[0].numel())
+    pairs = zip(prediction.split(images), target.split(images), strict=True)
+    parts = [ssim_map(x, y, window, data_range).mean(dim=1) for x, y in pairs]
+    local = torch.cat(parts)
     if mask is None:
         return local.mean(dim=(1, 2))
     border = WINDOWS[window].border
