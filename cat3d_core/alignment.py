@@ -85,7 +85,7 @@ def pose_errors(estimated: Cameras, truth: Cameras) -> PoseErrors:
 def rotation_angle_deg(a: Tensor, b: Tensor) -> Tensor:
     """Angle (N,) in degrees of the rotation from a to b, (N, 3, 3) each.
 
-    2 asin(|a - b| / (2 sqrt 2)), Frobenius norm: exact for small angles, where arccos of the trace loses half the digits.
+    2 asin(|a - b| / (2 sqrt 2)), Frobenius norm: exact for small angles, where arccos of the trace loses digits.
     """
     chord = torch.linalg.matrix_norm(a - b) / 8**0.5
     return 2 * torch.rad2deg(torch.asin(chord.clamp(max=1)))
