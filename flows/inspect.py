@@ -76,7 +76,10 @@ def array_row(store: SceneStore, path: str) -> dict[str, Any] | None:
     except StoreError as error:
         return {"path": path, "error": str(error), "bytes": 0, "bytes_stored": 0}
     wanted = {arrays.chunk_file(folder, array, chunk).name for chunk in arrays.chunk_coordinates(array)}
-    sizes = [entry.stat().st_size for entry in os.scandir(folder) if entry.name in wanted]
+    try:
+        sizes = [entry.stat().st_size for entry in os.scandir(folder) if entry.name in wanted]
+    except FileNotFoundError:
+        return None
     stored = sum(sizes)
     row_bytes = array.nbytes // max(1, len(wanted)) * len(sizes)  # of the chunks that are there
     return {
@@ -148,6 +151,9 @@ def camera_summary(section: Section) -> dict[str, Any] | None:
         return None
     except StoreError as error:
         return {"error": str(error)}
+    if not len(intrinsics) == len(world_from_camera) == len(size):
+        counts = (len(intrinsics), len(world_from_camera), len(size))
+        return {"error": f"intrinsics, world_from_camera and size are of {counts} views: they are being written."}
     if len(world_from_camera) == 0:
         return {"count": 0}
     focal_px = intrinsics[:, [0, 1], [0, 1]]

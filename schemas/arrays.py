@@ -6,6 +6,7 @@ the fill value: here it is an error. So empty (all-zero) chunks are always writt
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from schemas.documents import read_metadata
+from schemas.documents import discard, read_metadata, write_metadata
 from schemas.errors import MissingError, StoreError
 
 #: Largest chunk of a `parameter` array (a hash grid has gigabytes; blosc and crc32c work on chunks in memory).
@@ -66,23 +67,21 @@ def _storage(shape: tuple[int, ...], dtype: str, kind: str) -> dict[str, Any]:
         "filters": None,
         # One file a chunk beside zarr.json; the default separator would make a folder for every index of every axis.
         "chunk_key_encoding": {"name": "default", "separator": "."},
-        "config": {"write_empty_chunks": True},
     }
 
 
 def create(folder: Path, shape: tuple[int, ...], dtype: str, kind: str) -> None:
-    """Make a new array in `folder`, which must not exist."""
-    zarr.create_array(str(folder), **_storage(shape, dtype, kind))
-
-
-def matches(folder: Path, shape: tuple[int, ...], dtype: str, kind: str) -> bool:
-    """Whether `folder` holds an array that `create` would make the same way."""
+    """Make an array in `folder`. One of the same shape and storage is kept with its data, any other is replaced."""
+    memory: dict[str, Any] = {}
+    zarr.create_array(memory, **_storage(shape, dtype, kind))
+    wanted = json.loads(memory["zarr.json"].to_bytes())
     try:
-        found = open_array(folder, writable=False).metadata
+        if read_metadata(folder) == wanted:
+            return
     except StoreError:
-        return False
-    memory = zarr.create_array({}, **_storage(shape, dtype, kind)).metadata
-    return {**found.to_dict(), "attributes": {}} == {**memory.to_dict(), "attributes": {}}
+        pass
+    discard(folder)
+    write_metadata(folder, wanted)
 
 
 def open_array(folder: Path, writable: bool) -> zarr.Array:
@@ -91,6 +90,8 @@ def open_array(folder: Path, writable: bool) -> zarr.Array:
         raise StoreError(f"{folder} is a Zarr group, where an array was expected.")
     try:
         array = zarr.open_array(str(folder), mode="r+" if writable else "r", zarr_format=3)
+    except FileNotFoundError:  # removed by a writer since its metadata was read
+        raise MissingError(f"{folder} does not exist.") from None
     except (ValueError, KeyError, TypeError) as error:
         raise StoreError(f"{folder / 'zarr.json'} is damaged: {error}") from error
     return array.with_config({"write_empty_chunks": True})  # isn't stored with the array, so it is said again

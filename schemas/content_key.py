@@ -26,7 +26,8 @@ def content_key(**parts: Any) -> str:
 
     Raises ValueError for NaN and infinite floats (no configuration means them) and for types it has no rule for.
     """
-    return hashlib.sha256(json.dumps(_tagged(parts, "content key"), separators=(",", ":")).encode("ascii")).hexdigest()
+    tagged = [[name, _tagged(value, name)] for name, value in sorted(parts.items())]
+    return hashlib.sha256(json.dumps(tagged, separators=(",", ":")).encode("ascii")).hexdigest()
 
 
 def array_digest(array: NDArray[Any]) -> str:

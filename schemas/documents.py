@@ -1,16 +1,18 @@
 """JSON documents of a store: plain values only, written so that a reader never sees half a file.
 
-Group metadata (`zarr.json`) is written here and not by zarr-python, for three reasons: zarr writes the bare token NaN
-(not JSON), it updates attributes by read-modify-write, and it doesn't fsync, so that a record of completion could
-outlive the process and not the machine.
+Metadata (`zarr.json`) is written here and not by zarr-python, because zarr writes the bare token NaN (not JSON) and has
+no checksum, so that one flipped bit makes 2 views of 3. The checksum is the attribute `SEAL`, over everything else in
+the document. What a power cut can leave half-written is found by checksums; only records of completion are synced.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import math
 import os
+import shutil
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,6 +22,14 @@ import numpy as np
 from pydantic import BaseModel
 
 from schemas.errors import MissingError, StoreError
+
+#: Name of the attribute that holds a document's checksum.
+SEAL = "document_sha256"
+#: Entries that a `zarr.json` may have.
+KEYS = {
+    "zarr_format", "node_type", "attributes", "consolidated_metadata", "shape", "data_type", "chunk_grid",
+    "chunk_key_encoding", "fill_value", "codecs", "storage_transformers", "dimension_names",
+}
 
 
 def plain(value: Any, where: str = "value") -> Any:
@@ -53,19 +63,41 @@ def plain(value: Any, where: str = "value") -> Any:
     raise StoreError(f"{where} is a {type(value).__name__}, which can't be stored as JSON.")
 
 
-def write_bytes(path: Path, data: bytes) -> None:
-    """Replace the file atomically and durably: temporary in the same folder, fsync, rename, fsync of the folder."""
+def write_bytes(path: Path, data: bytes, durable: bool = False) -> None:
+    """Replace the file atomically, by a temporary in the same folder; `durable` waits until it survives a power cut."""
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
     try:
         with temporary.open("wb") as file:
             file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    sync_folder(path.parent)
+    if durable:
+        sync_folder(path.parent)
+
+
+def discard(folder: Path) -> bool:
+    """Remove a folder, by way of a hidden `.partial`, so that no reader sees half of it. False if there was none."""
+    trash = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.partial")
+    try:
+        folder.rename(trash)
+    except FileNotFoundError:
+        return False
+    shutil.rmtree(trash)
+    return True
+
+
+def leftovers(root: Path) -> list[Path]:
+    """Temporary files and folders (`*.partial`) below `root`, sorted: being written now, or left by a killed writer."""
+    found = []
+    for folder, folders, files in os.walk(root):  # which passes over what vanishes meanwhile
+        found += [Path(folder, name) for name in (*folders, *files) if name.endswith(".partial")]
+        folders[:] = [name for name in folders if not name.endswith(".partial")]
+    return sorted(found)
 
 
 def sync_folder(folder: Path) -> None:
@@ -77,15 +109,24 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def write_group(folder: Path, attributes: Mapping[str, Any]) -> None:
-    """Make `folder` a Zarr v3 group with these attributes, or replace the attributes of the one that is there."""
-    document = {"zarr_format": 3, "node_type": "group", "attributes": plain(attributes, f"attributes of {folder.name}")}
+def write_metadata(folder: Path, document: Mapping[str, Any], durable: bool = False) -> None:
+    """Write the `zarr.json` of a group or array, with its checksum."""
+    sealed = {**document, "attributes": {**document["attributes"], SEAL: _seal(document)}}
     folder.mkdir(parents=True, exist_ok=True)
-    write_bytes(folder / "zarr.json", json.dumps(document, indent=2, allow_nan=False).encode())
+    write_bytes(folder / "zarr.json", json.dumps(sealed, indent=2, allow_nan=False).encode(), durable)
+
+
+def write_group(folder: Path, attributes: Mapping[str, Any], durable: bool = False) -> None:
+    """Make `folder` a Zarr v3 group with these attributes, or replace the attributes of the one that is there."""
+    attributes = plain(attributes, f"attributes of {folder.name}")
+    write_metadata(folder, {"zarr_format": 3, "node_type": "group", "attributes": attributes}, durable)
 
 
 def read_metadata(folder: Path) -> dict[str, Any]:
-    """The `zarr.json` of a group or array. Raises MissingError or StoreError."""
+    """The `zarr.json` of a group or array, checked and without its checksum. Raises MissingError or StoreError.
+
+    A document without a checksum, as other programs write, is taken as it is.
+    """
     path = folder / "zarr.json"
     try:
         document = json.loads(path.read_bytes(), parse_constant=_refuse_constant)
@@ -95,16 +136,28 @@ def read_metadata(folder: Path) -> dict[str, Any]:
         raise StoreError(f"{path} is damaged: it isn't JSON ({error}).") from None
     if not isinstance(document, dict) or document.get("node_type") not in ("group", "array"):
         raise StoreError(f"{path} is damaged: it describes neither a Zarr group nor a Zarr array.")
+    if unknown := set(document) - KEYS:  # a damaged key would hide what it held
+        raise StoreError(f"{path} is damaged: it has the entries {sorted(unknown)}, which Zarr doesn't know.")
+    attributes = document.setdefault("attributes", {})
+    if not isinstance(attributes, dict):
+        raise StoreError(f"{path} is damaged: its attributes are no mapping.")
+    seal = attributes.pop(SEAL, None)
+    if seal is not None and seal != _seal(document):
+        raise StoreError(f"{path} is damaged, or was changed by another program: its checksum doesn't match.")
     return document
 
 
 def read_group(folder: Path) -> dict[str, Any]:
     """Attributes of the group at `folder`. Raises MissingError or StoreError."""
     document = read_metadata(folder)
-    attributes = document.get("attributes", {})
-    if document["node_type"] != "group" or not isinstance(attributes, dict):
-        raise StoreError(f"{folder / 'zarr.json'} is damaged: a Zarr group with attributes was expected there.")
+    if document["node_type"] != "group":
+        raise StoreError(f"{folder} is a Zarr array, where a group was expected.")
+    attributes: dict[str, Any] = document["attributes"]
     return attributes
+
+
+def _seal(document: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
 
 
 def _refuse_constant(token: str) -> None:

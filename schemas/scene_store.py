@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from schemas import migrations
-from schemas.documents import read_metadata
+from schemas.documents import leftovers, read_metadata
 from schemas.errors import MissingError, StoreError
 from schemas.layout import FORMAT, SCENE_STAGES, SCHEMA_VERSION, STAGES, check_stage, downstream
 from schemas.section import Section, checked_name, make_tree
@@ -154,7 +154,7 @@ class SceneStore(Section):
     def sweep(self) -> list[str]:
         """Remove what killed writers left behind (`*.partial`). Only while nobody writes. Returns what was removed."""
         self._check_writable()
-        found = sorted(self.folder.rglob("*.partial"))
+        found = leftovers(self.folder)
         for path in found:
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
         return [str(path.relative_to(self.folder)) for path in found]
@@ -181,8 +181,8 @@ def _root_attributes(path: Path) -> dict[str, Any]:
             raise StoreError(f"{path} is half-written: its zarr.json is missing. Make the store again.")
         raise StoreError(f"{path} is not a Zarr store: it has no zarr.json.")
     document = read_metadata(path)
-    attributes = document.get("attributes") or {}
-    if document["node_type"] != "group" or not isinstance(attributes, dict) or attributes.get("format") != FORMAT:
+    attributes: dict[str, Any] = document["attributes"]
+    if document["node_type"] != "group" or attributes.get("format") != FORMAT:
         raise StoreError(f"{path} is a Zarr {document['node_type']} of someone else, not a cat3d scene store.")
     return attributes
 

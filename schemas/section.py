@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas import arrays
-from schemas.documents import plain, read_group, sync_folder, write_group
+from schemas.documents import discard, plain, read_group, write_group
 from schemas.errors import MissingError, StoreError
 from schemas.layout import array_spec
-from schemas.stages import discard
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
@@ -76,9 +75,6 @@ class Section:
             raise ValueError(f"The layout doesn't know {join(self.path, name)!r}: say its dtype and kind.")
         if spec is not None and not spec.fits(wanted):
             raise StoreError(f"{join(self.path, name)} has the dimensions {spec.dims}, but {wanted} was asked for.")
-        if arrays.matches(self.folder / name, wanted, dtype, kind):
-            return
-        self.remove(name)
         arrays.create(self.folder / name, wanted, dtype, kind)
 
     def write(self, name: str, values: Any, dtype: str | None = None, kind: str | None = None) -> None:
@@ -180,7 +176,6 @@ def make_tree(folder: Path, attributes: Mapping[str, Any], groups: Sequence[str]
         if (folder / "zarr.json").exists():
             return False
         raise StoreError(f"{folder} can't be made: {error.strerror or error}.") from error
-    sync_folder(folder.parent)
     return True
 
 

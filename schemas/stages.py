@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
-import uuid
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from schemas.documents import plain, read_group, sync_folder, write_group
+from schemas.documents import discard, plain, read_group, write_group
 from schemas.errors import MissingError, StoreError
 
 
@@ -56,21 +54,9 @@ def read_record(stages: Path, stage: str) -> StageRecord | None:
 
 def write_record(stages: Path, record: StageRecord) -> None:
     """Write or replace a record, atomically and durably."""
-    write_group(stages / record.stage, plain(record, f"record of {record.stage}"))
+    write_group(stages / record.stage, plain(record, f"record of {record.stage}"), durable=True)
 
 
 def remove_record(stages: Path, stage: str) -> bool:
     """Take a record away; returns whether there was one."""
     return discard(stages / stage)
-
-
-def discard(folder: Path) -> bool:
-    """Remove a folder, by way of a hidden `.partial`, so that no reader sees half of it. False if there was none."""
-    trash = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.partial")
-    try:
-        folder.rename(trash)
-    except FileNotFoundError:
-        return False
-    sync_folder(folder.parent)
-    shutil.rmtree(trash)
-    return True

@@ -10,7 +10,7 @@ from pathlib import Path
 from zarr.codecs import Crc32cCodec
 
 from schemas import arrays
-from schemas.documents import read_metadata
+from schemas.documents import SEAL, leftovers, read_metadata
 from schemas.errors import MissingError, StoreError
 from schemas.layout import SCENE_STAGES, array_spec, done_path
 from schemas.scene_store import SceneStore
@@ -28,12 +28,8 @@ class Problem:
 
 def nodes(root: Path, path: str = "") -> Iterator[tuple[str, str]]:
     """(path, "array" | "group" | "damaged") of everything below a group, sorted; hidden names are passed over."""
-    try:
-        names = sorted(entry.name for entry in os.scandir(root / path) if entry.is_dir())
-    except FileNotFoundError:  # removed by a writer since it was listed
-        return
-    for name in names:
-        if name.startswith("."):
+    for name in sorted(_listing(root / path)):
+        if name.startswith(".") or not (root / path / name).is_dir():
             continue
         child = f"{path}/{name}" if path else name
         try:
@@ -64,6 +60,7 @@ def verify(store: SceneStore) -> Iterator[Problem]:
 def verify_array(store: SceneStore, path: str) -> Iterator[Problem]:
     """Read every chunk of an array. One that isn't there is a problem if its stage or its view is marked as done."""
     folder = store.folder / path
+    version = _version(folder)
     try:
         array = arrays.open_array(folder, writable=False)
     except MissingError:
@@ -71,29 +68,50 @@ def verify_array(store: SceneStore, path: str) -> Iterator[Problem]:
     except StoreError as error:
         yield Problem("corrupted", path, str(error))
         return
-    if not any(isinstance(codec, Crc32cCodec) for codec in array.compressors):
+    if not any(isinstance(codec, Crc32cCodec) for codec in array.compressors) or SEAL not in array.attrs:
         yield Problem("unchecked", path, f"{folder} is stored without checksums: damage can't be seen.")
-    expected = set()
+    expected = {"zarr.json"}
+    found: list[Problem] = []
     for chunk in arrays.chunk_coordinates(array):
-        expected.add(arrays.chunk_file(folder, array, chunk).name)
+        file = arrays.chunk_file(folder, array, chunk)
+        expected.add(file.name)
         try:
             arrays.read_chunk(folder, array, chunk)
         except MissingError as error:
-            if (folder / "zarr.json").exists() and _should_be_there(store, path, chunk):
-                yield Problem("missing", path, str(error), chunk)
+            # Asked in this order, because a writer may be writing the view and then its mark at this moment.
+            if _should_be_there(store, path, chunk) and not file.exists():
+                found.append(Problem("missing", path, str(error), chunk))
         except StoreError as error:
-            yield Problem("corrupted", path, str(error), chunk)
-    for file in sorted(folder.glob("c*")):
-        if file.name not in expected and not file.name.endswith(".partial"):
-            yield Problem("orphan", f"{path}/{file.name}", f"{file} belongs to no chunk of the array.")
+            found.append(Problem("corrupted", path, str(error), chunk))
+    for file in map(folder.joinpath, sorted(_listing(folder))):
+        if file.is_file() and file.name not in expected and not file.name.endswith(".partial"):
+            found.append(Problem("orphan", f"{path}/{file.name}", f"{file} belongs to no chunk of the array."))
+    if _version(folder) == version:  # else a writer has replaced the array meanwhile: what was read were two halves
+        yield from found
+
+
+def _listing(folder: Path) -> list[str]:
+    """Names in a folder, none if a writer has removed it meanwhile."""
+    try:
+        return os.listdir(folder)
+    except FileNotFoundError:
+        return []
+
+
+def _version(folder: Path) -> tuple[int, int] | None:
+    """What tells an array from another that takes its place."""
+    try:
+        status = (folder / "zarr.json").stat()
+    except FileNotFoundError:
+        return None
+    return status.st_ino, status.st_mtime_ns
 
 
 def orphans(root: Path) -> Iterator[Problem]:
     """Files and folders a killed writer left behind, or that one is writing at this moment."""
-    for path in sorted(root.rglob("*.partial")):
-        if not any(parent.name.endswith(".partial") for parent in path.relative_to(root).parents):
-            relative = str(path.relative_to(root))
-            yield Problem("orphan", relative, f"{path} was left by a writer that was killed, or is being written now.")
+    for path in leftovers(root):
+        relative = str(path.relative_to(root))
+        yield Problem("orphan", relative, f"{path} was left by a writer that was killed, or is being written now.")
 
 
 def _should_be_there(store: SceneStore, path: str, chunk: tuple[int, ...]) -> bool:
