@@ -1,0 +1,91 @@
+"""The command `cat3d`. Exit codes: 0 done, 1 something failed (the message says what), 2 wrong usage."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(
+    help="3D scenes from a handful of photos: an open, batch implementation of the CAT3D paper.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for stores, tables, pictures and the report.")]
+
+
+@app.command()
+def run(
+    source: Annotated[
+        str, typer.Argument(help="A scene's folder (any supported layout, or just photos), or procedural:FAMILY/SEED.")
+    ],
+    out: OutOption = Path("outputs"),
+    views: Annotated[
+        str, typer.Option(help="Training views: counts with a split of the data set, or all; several by commas.")
+    ] = "all",
+    downscale: Annotated[int, typer.Option(help="Divide image width and height by this.")] = 1,
+    method: Annotated[
+        str, typer.Option(help="zipnerf: captured views only; cat3d: with generated views.")
+    ] = "zipnerf",
+    preset: Annotated[str, typer.Option(help="Reconstruction preset: fast, balanced, paper.")] = "fast",
+    seed: Annotated[int, typer.Option(help="All randomness follows from it.")] = 0,
+    reader: Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")] = "auto",
+    images: Annotated[str | None, typer.Option(help="Image folder inside the scene, where there are several.")] = None,
+    config: Annotated[Path | None, typer.Option(help="Settings from a YAML or JSON file; options here win.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="One setting, e.g. --set render.path_views=30. May be repeated.")
+    ] = None,
+) -> None:
+    """Photos in, 3D scene out: renders, metrics and a report. Stages that are done already are not done again."""
+    from flows.run_command import run_command
+
+    given = {"downscale": downscale, "method": method, "preset": preset, "seed": seed}
+    run_command(source, out, views.split(","), given, reader, images, config, set_ or [])
+
+
+@app.command()
+def demo(
+    out: OutOption = Path("outputs/demo"),
+    smallest: Annotated[bool, typer.Option("--smallest", help="As small as it gets, for CI.")] = False,
+) -> None:
+    """One small procedural scene from nothing to a report, in minutes on two cores."""
+    from flows.run_command import demo_command
+
+    demo_command(out, smallest)
+
+
+@app.command()
+def inspect(
+    store: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder).")],
+    verify: Annotated[bool, typer.Option("--verify", help="Read every chunk and check it.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
+) -> None:
+    """What a store holds: arrays, stages done, cameras, what is stale."""
+    from flows.inspect_command import inspect_command
+
+    inspect_command(store, verify, as_json)
+
+
+def main() -> None:
+    """Entry point: errors a user can act on end in one sentence and exit code 1, without a traceback."""
+    from flows.errors import describe
+
+    try:
+        app()
+    except KeyboardInterrupt:
+        print("Interrupted. What is stored stays; run the same command again to go on.", file=sys.stderr)
+        sys.exit(130)
+    except Exception as error:
+        sentence = describe(error)
+        if sentence is None:
+            raise
+        print(f"cat3d: {sentence}", file=sys.stderr)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

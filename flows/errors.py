@@ -1,0 +1,19 @@
+"""Which errors are the user's to act on, and the sentence for each."""
+
+from __future__ import annotations
+
+from flows.readers.base import InputError
+from flows.server import ServerError
+from schemas.errors import ConfigError, StoreError
+
+
+def describe(error: BaseException) -> str | None:
+    """The sentence a user sees, or None for a fault of ours, which deserves its traceback."""
+    from cat3d_core.nerf import NonFiniteError
+
+    if isinstance(error, (InputError, StoreError, ConfigError, ServerError, NonFiniteError)):
+        return str(error)
+    if isinstance(error, OSError) and error.errno is not None:
+        where = f" ({error.filename})" if error.filename else ""
+        return f"The system refused: {error.strerror}{where}. Free space or permissions may be missing."
+    return None

@@ -1,0 +1,109 @@
+"""`cat3d run` and `cat3d demo`: make the jobs, see what is missing, run the flow with one server, write the report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from flows.jobs import Job, capture_digests, expected_steps, make_jobs, pending
+from flows.progress import console
+from flows.readers.base import InputError
+from schemas.config import RunConfig, load_config, parse_config
+from schemas.errors import ConfigError
+
+#: Where each command-line option lives in the configuration.
+OPTION_FIELDS = {
+    "downscale": ("ingest", "downscale"),
+    "method": ("method",),
+    "preset": ("reconstruct", "preset"),
+    "seed": ("seed",),
+}
+DEMO_SOURCE = "procedural:llff/1"
+
+
+def run_command(
+    source: str,
+    out: Path,
+    views: Sequence[str],
+    given: dict[str, Any],
+    reader: str = "auto",
+    image_folder: str | None = None,
+    config_file: Path | None = None,
+    settings: Sequence[str] = (),
+) -> list[Job]:
+    """Do everything that is not done yet for one scene and its splits. Raises InputError, ConfigError and others."""
+    started = time.monotonic()
+    config = make_config(given, config_file, settings)
+    with console.status(f"Reading {source}"):
+        capture, jobs = make_jobs(source, out.resolve(), [v.strip() for v in views], config, reader, image_folder)
+        digests = capture_digests(capture)
+        todo = {job.run: pending(job, expected_steps(job, capture, digests)) for job in jobs}
+    console.print(f"{capture.scene_id}: {len(capture)} views ({capture.dataset})")
+    for job in jobs:
+        steps = todo[job.run]
+        if steps:
+            console.print(f"  {job.run}: to do: " + ", ".join(f"{s.stage} ({s.why})" for s in steps))
+        else:
+            console.print(f"  {job.run}: every stage is done already; nothing to do.")
+    if any(todo.values()):
+        from flows.server import prefect_server
+
+        with prefect_server(out.resolve() / ".prefect"):
+            from flows.scene import scene_flow
+
+            scene_flow(capture.scene_id, [job.model_dump(mode="json") for job in jobs])
+    from flows.report import print_metrics, write_report
+
+    report = write_report(out.resolve(), only_if_changed=not any(todo.values()))
+    print_metrics(out.resolve(), capture.scene_id)
+    console.print(f"Report: {report}  ({time.monotonic() - started:.0f} s)")
+    return jobs
+
+
+def demo_command(out: Path, smallest: bool) -> None:
+    """A procedural scene, three views and all, at a size that two cores finish in minutes."""
+    given = {"downscale": 2 if smallest else 1, "preset": "fast"}
+    settings = ["render.path_views=24"]
+    views = ["3", "all"]
+    if smallest:
+        settings = ["render.path_views=4", "reconstruct.overrides={iterations: 60, batch_rays: 512}"]
+        views = ["3"]
+    run_command(DEMO_SOURCE, out, views, given, settings=settings)
+
+
+def make_config(given: dict[str, Any], config_file: Path | None, settings: Sequence[str]) -> RunConfig:
+    """The run's configuration: file, then --set, then options that differ from their defaults."""
+    document = load_config(config_file).model_dump(mode="json") if config_file else {}
+    defaults = RunConfig().model_dump(mode="json")
+    for name, value in given.items():
+        path = OPTION_FIELDS[name]
+        if config_file is None or value != _get(defaults, path):
+            _set(document, path, value)
+    for text in settings:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {text}: write it as NAME=VALUE, e.g. --set render.path_views=30.")
+        try:
+            parsed = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise ConfigError(f"--set {text}: the value is not valid YAML.") from None
+        _set(document, tuple(name.split(".")), parsed)
+    return parse_config(document, "the settings")
+
+
+def _get(document: dict[str, Any], path: tuple[str, ...]) -> Any:
+    for part in path:
+        document = document[part]
+    return document
+
+
+def _set(document: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
+    for part in path[:-1]:
+        document = document.setdefault(part, {})
+        if not isinstance(document, dict):
+            raise InputError(f"--set {'.'.join(path)}: {part} is a value, not a group of settings.")
+    document[path[-1]] = value

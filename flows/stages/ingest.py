@@ -1,0 +1,117 @@
+"""Stage ingest: image files -> undistorted, downscaled uint8 images in the store."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cat3d_core.cameras import Cameras
+from flows import images
+from flows.jobs import Job, Outcome, capture_digests
+from flows.progress import meter
+from flows.readers.base import Capture, InputError
+from schemas.scene_store import SceneStore
+
+VERSION = 1
+
+
+class Ingested(NamedTuple):
+    """One view: image (h, w, 3) uint8, mask (h, w) uint8 or None, intrinsics (3, 3) of that image or None."""
+
+    image: np.ndarray
+    mask: np.ndarray | None
+    intrinsics: Tensor | None
+
+
+def execute(job: Job, store: SceneStore, key: str) -> Outcome:
+    """Write `captured/`: image, size, name, source_sha256, and mask and intrinsics where the data set has them."""
+    capture = job.capture()
+    count = len(capture)
+    with meter(f"ingest {job.scene_id}", count) as progress, ThreadPoolExecutor(2) as pool:
+
+        def one(view: int) -> Ingested:
+            out = ingest_view(capture, view, job.config.ingest.downscale, job.config.ingest.max_pixels)
+            progress.advance(note=capture.names[view])
+            return out
+
+        views = list(pool.map(one, range(count)))
+    write_captured(store, capture, views)
+    decisions = list(capture.notes)
+    if capture.missing:
+        decisions.append(
+            f"{len(capture.missing)} listed frames have no image and were left out: "
+            + ", ".join(capture.missing[:5]) + (" ..." if len(capture.missing) > 5 else "")
+        )  # fmt: skip
+    if capture.distortion is not None and capture.distortion.any():
+        decisions.append("The images were undistorted; the stored intrinsics are those of the pinhole images.")
+    pixels = sum(v.image.shape[0] * v.image.shape[1] for v in views)
+    return Outcome({"views": count, "pixels": pixels}, decisions)
+
+
+def write_captured(store: SceneStore, capture: Capture, views: list[Ingested]) -> None:
+    """Write all views' images (padded to the largest), sizes, names and digests, and K where it is known."""
+    captured = store.captured
+    sizes = np.array([[v.image.shape[1], v.image.shape[0]] for v in views], np.int32)
+    width, height = sizes.max(0)
+    captured.write("size", sizes)
+    captured.write("name", np.array(capture.names, dtype=object))
+    captured.write("source_sha256", np.array(list(capture_digests(capture)["images"].values()), dtype=object))
+    captured.create_array("image", (len(views), height, width, 3))
+    captured.write_images("image", [v.image for v in views], range(len(views)))
+    masks = [v.mask for v in views]
+    if any(m is not None for m in masks):
+        captured.create_array("mask", (len(views), height, width))
+        full = [np.full(v.image.shape[:2], 255, np.uint8) if v.mask is None else v.mask for v in views]
+        captured.write_images("mask", full, range(len(views)))
+    else:
+        captured.remove("mask")
+    if all(v.intrinsics is not None for v in views):
+        captured.write("intrinsics", torch.stack([v.intrinsics for v in views]).numpy())
+    else:
+        captured.remove("intrinsics")
+
+
+def ingest_view(
+    capture: Capture, view: int, downscale: float, max_pixels: int, distortion: Tensor | None = None,
+    camera: Cameras | None = None,
+) -> Ingested:  # fmt: skip
+    """Read one view, undistort it at full size, then shrink it.
+
+    camera and distortion override the capture's own (for poses that were estimated).
+    Raises InputError for an unreadable image or one whose size contradicts its camera.
+    """
+    if capture.images is not None:
+        image, alpha = capture.images[view], None
+    else:
+        image, alpha = images.read_image(capture.paths[view], max_pixels=max_pixels)
+    mask = alpha
+    if capture.masks and capture.masks[view] is not None:
+        mask = images.read_mask(capture.masks[view])
+        if mask.shape != image.shape[:2]:
+            mask = images.resize(mask, image.shape[1], image.shape[0])
+    height, width = image.shape[:2]
+    if camera is None and capture.cameras is not None:
+        camera = capture.cameras[view]
+    if distortion is None and capture.distortion is not None:
+        distortion = capture.distortion[view]
+    if camera is not None and camera.size[0].tolist() != [width, height]:
+        raise InputError(
+            f"Image {capture.names[view]} is {width} x {height} pixels, but its camera is for "
+            f"{camera.size[0, 0]} x {camera.size[0, 1]}; give the image the camera belongs to."
+        )
+    if camera is not None and distortion is not None and distortion.any():
+        original = camera.intrinsics[0]
+        image, intrinsics = images.undistort(image, original, distortion)
+        if mask is not None:
+            mask, _ = images.undistort(mask, original, distortion, nearest=True)
+        camera = Cameras(intrinsics[None], camera.world_from_camera, camera.size)
+    small_width, small_height = max(1, round(width / downscale)), max(1, round(height / downscale))
+    image = images.resize(image, small_width, small_height)
+    if mask is not None:
+        mask = images.resize(mask, small_width, small_height)
+    intrinsics = camera.resize(small_width, small_height).intrinsics[0] if camera is not None else None
+    return Ingested(image, mask, intrinsics)

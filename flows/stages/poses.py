@@ -1,0 +1,120 @@
+"""Stage poses: cameras of the captured views in the scene frame; estimated by SfM only where none are given."""
+
+from __future__ import annotations
+
+import contextlib
+
+import numpy as np
+import torch
+
+from cat3d_core.cameras import Cameras, orthonormalize
+from cat3d_core.normalization import Similarity, normalize_scene
+from flows import images
+from flows.jobs import Job, Outcome
+from flows.poses import PoseSettings, estimate_poses
+from flows.progress import Meter, meter
+from flows.readers.base import Capture
+from flows.stages.common import write_cameras
+from flows.stages.ingest import ingest_view, write_captured
+from schemas.scene_store import SceneStore
+
+VERSION = 1
+
+
+def execute(job: Job, store: SceneStore, key: str) -> Outcome:
+    """Write `world_from_camera` (scene frame), `registered`, points and depth bounds, and the similarity."""
+    capture = job.capture()
+    if capture.cameras is not None:
+        decisions = ["Skipped pose estimation: the cameras are given."]
+        cameras = _stored_cameras(store, capture.cameras)
+        registered = np.ones(len(capture), bool)
+        points, bounds = capture.points, capture.depth_bounds
+    else:
+        cameras, registered, points, decisions = _estimate(job, store, capture)
+        bounds = None
+    if job.config.poses.normalize:
+        similarity = normalize_scene(cameras[np.flatnonzero(registered).tolist()], points, bounds)
+        decisions.append(f"The scene's scale was set from {similarity.method}.")
+    else:
+        similarity = Similarity(1.0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), "none")
+    write_poses(store, cameras, registered, similarity, points, bounds)
+    return Outcome({"views": int(registered.sum())}, decisions)
+
+
+def _estimate(
+    job: Job, store: SceneStore, capture: Capture
+) -> tuple[Cameras, np.ndarray, torch.Tensor | None, list[str]]:
+    """Cameras of all views by structure from motion; the stored images are undistorted with the lens that was found.
+
+    Views that could not be placed get the first placed camera and registered = False.
+    """
+    settings = job.config.poses
+    chosen = PoseSettings(
+        max_features=settings.max_features, minimum_share=settings.min_registered, camera_model=settings.camera_model
+    )
+    photos = capture.images if capture.images is not None else capture.paths
+    meters: dict[str, Meter] = {}
+    with contextlib.ExitStack() as stack:
+
+        def on_progress(step: str, done: int, total: int) -> None:
+            if step not in meters:
+                meters[step] = stack.enter_context(meter(f"poses {job.scene_id}: {step}", total))
+            meters[step].update(done)
+
+        result = estimate_poses(photos, job.config.seed, on_progress=on_progress, masks=capture.masks, settings=chosen)
+    registered = np.zeros(len(capture), bool)
+    registered[result.registered] = True
+    row = {view: i for i, view in enumerate(result.registered)}
+    views = []
+    for view in range(len(capture)):
+        i = row.get(view, 0)
+        camera = result.cameras[i]
+        lens = result.distortion[i] if result.distortion is not None and view in row else None
+        if view not in row:  # an unplaced photo may have another size; its camera is a stand-in of the right shape
+            image = photos[view] if capture.images is not None else images.image_size(photos[view])
+            width, height = (image.shape[1], image.shape[0]) if isinstance(image, np.ndarray) else image
+            camera = camera.resize(width, height)
+        views.append(ingest_view(capture, view, job.config.ingest.downscale, job.config.ingest.max_pixels, lens, camera))
+    write_captured(store, capture, views)
+    size = torch.from_numpy(store.captured.read("size").astype(np.int64))
+    poses = torch.stack([result.cameras.world_from_camera[row.get(v, 0)] for v in range(len(capture))])
+    cameras = Cameras(torch.stack([v.intrinsics for v in views]), orthonormalize(poses), size)
+    points = result.points if len(result.points) else None
+    return cameras, registered, points, [result.report.summary()]
+
+
+def _stored_cameras(store: SceneStore, given: Cameras) -> Cameras:
+    """The given poses with the intrinsics and sizes of the stored (undistorted, downscaled) images."""
+    size = torch.from_numpy(store.captured.read("size").astype(np.int64))
+    intrinsics = torch.from_numpy(store.captured.read("intrinsics"))
+    return Cameras(intrinsics, orthonormalize(given.world_from_camera.double()), size)
+
+
+def write_poses(
+    store: SceneStore,
+    cameras: Cameras,
+    registered: np.ndarray,
+    similarity: Similarity,
+    points: torch.Tensor | None,
+    depth_bounds: torch.Tensor | None,
+) -> None:
+    """Move everything into the scene frame and write it; cameras are in the data set's world."""
+    captured = store.captured
+    write_cameras(captured, similarity.cameras(cameras))
+    captured.write("registered", registered, dtype="bool", kind="small")
+    for name, values in (
+        ("points", None if points is None else similarity.points(points.double()).float()),
+        ("depth_bounds", None if depth_bounds is None else depth_bounds.double() * similarity.scale),
+    ):
+        if values is None:
+            captured.remove(name)
+        else:
+            captured.write(name, values.numpy())
+    captured.set_attrs(
+        similarity={
+            "scale": similarity.scale,
+            "rotation": similarity.rotation.tolist(),
+            "translation": similarity.translation.tolist(),
+            "method": similarity.method,
+        }
+    )

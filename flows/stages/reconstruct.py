@@ -1,0 +1,168 @@
+"""Stage reconstruct: captured (and generated) views -> one field, checkpointed while it trains."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from typing import Any
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from cat3d_core.cameras import Cameras
+from cat3d_core.metrics.perceptual import find_perceptual
+from cat3d_core.nerf import PRESETS, Field, ReconstructConfig, Trainer, Views
+from flows.jobs import Job, Outcome
+from flows.progress import meter
+from flows.stages.common import read_cameras, read_images, views_with_role
+from schemas.errors import ConfigError
+from schemas.scene_store import Run, SceneStore
+
+VERSION = 1
+CHECKPOINT_INTERVAL_S = 20.0
+#: CAT3D: LPIPS weight 1 on CO3D and mip-NeRF 360, 0.25 elsewhere.
+STRONG_LPIPS_DATASETS = ("co3d", "mip360", "mipnerf360")
+
+
+def trainer_config(job: Job) -> ReconstructConfig:
+    """The preset with the family's LPIPS weight and the run's overrides. Raises ConfigError naming a bad setting."""
+    settings = job.config.reconstruct
+    config = PRESETS[settings.preset]
+    if job.dataset in STRONG_LPIPS_DATASETS:
+        config = dataclasses.replace(config, lpips_weight=1.0)
+    known = {f.name for f in dataclasses.fields(ReconstructConfig)}
+    unknown = sorted(set(settings.overrides) - known)
+    if unknown:
+        raise ConfigError(
+            f"reconstruct.overrides: {unknown[0]} is not a setting of the trainer; "
+            f"those are {', '.join(sorted(known))}."
+        )
+    values = {n: tuple(v) if isinstance(v, list) else v for n, v in settings.overrides.items()}
+    try:
+        return dataclasses.replace(config, **values)
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"reconstruct.overrides: {error}") from None
+
+
+def inputs(job: Job) -> dict[str, Any]:
+    """The full trainer configuration and the LPIPS network: a changed preset makes old fields stale."""
+    config = trainer_config(job)
+    perceptual = find_perceptual() if config.lpips_weight > 0 else None
+    return {"trainer": dataclasses.asdict(config), "perceptual": perceptual.name if perceptual else None}
+
+
+def execute(job: Job, store: SceneStore, key: str) -> Outcome:
+    """Train the field, write `field/` (parameters, training record); goes on from its checkpoint if it was stopped."""
+    run = store.run(job.run)
+    config = trainer_config(job)
+    views, decisions = training_views(job, store, run)
+    smallest = int(views.size.min())
+    if config.patch_size > smallest:
+        config = dataclasses.replace(config, patch_size=smallest)
+        decisions.append(f"LPIPS patches are {smallest} pixels, the shorter side of the smallest view.")
+    perceptual = find_perceptual() if config.lpips_weight > 0 else None
+    if perceptual is None and config.lpips_weight > 0:
+        decisions.append("No perceptual network was found on this machine: trained without the LPIPS loss.")
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    trainer = Trainer(config, views, job.config.seed, device, perceptual)
+    checkpoint = Checkpoint(job, key)
+    resumed = checkpoint.load(trainer)
+    if resumed:
+        decisions.append(f"Went on from the checkpoint at iteration {trainer.iteration}.")
+    record = []
+    saved = started = time.monotonic()
+    with meter(f"reconstruct {job.scene_id} {job.run}", config.iterations) as progress:
+        while not _finished(trainer):
+            step = trainer.step()
+            if trainer.iteration % 10 == 0 or _finished(trainer):
+                record.append([trainer.iteration, time.monotonic() - started, step["loss"], step["psnr"]])
+            progress.update(trainer.iteration, f"{step['psnr']:.1f} dB")
+            if time.monotonic() - saved > CHECKPOINT_INTERVAL_S:
+                checkpoint.save(trainer)
+                saved = time.monotonic()
+    if trainer.iteration < config.iterations:
+        decisions.append(f"Stopped early at iteration {trainer.iteration}: the held-out loss no longer improved.")
+    if trainer.skipped:
+        decisions.append(f"{trainer.skipped} steps with a non-finite loss or gradient were skipped.")
+    write_field(run, trainer.field, record)
+    checkpoint.remove()
+    rays = (trainer.iteration - resumed) * config.batch_rays
+    return Outcome({"views": len(views), "steps": trainer.iteration - resumed, "rays": rays}, decisions)
+
+
+def _finished(trainer: Trainer) -> bool:
+    # `converged` is the early stop on a plateau of the held-out loss (plateau_patience).
+    return trainer.iteration >= trainer.config.iterations or getattr(trainer, "converged", False)
+
+
+def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[str]]:
+    """The run's training views: captured ones, and the generated ones where the run has them."""
+    train = views_with_role(store, run, "train")
+    cameras = read_cameras(store.captured, train)
+    images = read_images(store.captured, train)
+    decisions = []
+    if job.config.method == "zipnerf":
+        decisions.append("No views were generated: method zipnerf trains on captured views alone.")
+    else:
+        shown = run.generated.read("done_image").any(-1).nonzero()[0].tolist()
+        cameras = Cameras.cat([cameras, read_cameras(run.plan, shown).resize(*_image_size(run))])
+        images += [torch.from_numpy(image) for image in run.generated.read("image", shown)]
+    captured = torch.arange(len(cameras)) < len(train)
+    return Views(cameras, images, captured), decisions
+
+
+def _image_size(run: Run) -> tuple[int, int]:
+    _, height, width, _ = run.generated.shape("image")
+    return width, height
+
+
+def write_field(run: Run, field: Field, record: list[list[float]]) -> None:
+    """Write the parameters and the training record (rows of iteration, seconds, loss, PSNR of the batch)."""
+    run.remove("field")
+    section = run.section("field", create=True)
+    state = field.state_dict()
+    for name, value in state.items():
+        section.write(name, value.detach().float().cpu().numpy())
+    section.write("record", torch.tensor(record, dtype=torch.float32).reshape(-1, 4).numpy())
+    section.set_attrs(parameters=sorted(state), record_columns=["iteration", "seconds", "loss", "psnr_db"])
+
+
+def read_field(job: Job, run: Run) -> Field:
+    """The trained field as `write_field` left it, on this machine's device."""
+    section = run.field
+    field = Field(trainer_config(job))
+    state = {name: torch.from_numpy(section.read(name)) for name in section.attrs["parameters"]}
+    field.load_state_dict(state)
+    return field.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+
+
+class Checkpoint:
+    """The trainer's state on disk while the stage runs, beside the store, replaced atomically."""
+
+    def __init__(self, job: Job, key: str) -> None:
+        self.path = job.out / ".work" / f"{job.scene_id}-{job.run}.safetensors"
+        self.key = key  # only a step with the same inputs and settings may go on from it
+
+    def save(self, trainer: Trainer) -> None:
+        """Write the state; a kill at any moment leaves the old or the new one."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        part = self.path.with_suffix(f".{os.getpid()}.part")
+        save_file(trainer.state(), part, metadata={"key": self.key})
+        os.replace(part, self.path)
+
+    def load(self, trainer: Trainer) -> int:
+        """Continue from the checkpoint if there is one of this very step; the iteration reached, or 0."""
+        if not self.path.exists():
+            return 0
+        with safe_open(self.path, "pt") as file:
+            if (file.metadata() or {}).get("key") != self.key:
+                return 0
+            trainer.load_state({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
+        return trainer.iteration
+
+    def remove(self) -> None:
+        """The stage is complete; the state is no longer needed."""
+        self.path.unlink(missing_ok=True)
+

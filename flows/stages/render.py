@@ -1,0 +1,110 @@
+"""Stage render: the field -> images and depth of the held-out views and of a camera path, with a video."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from cat3d_core.cameras import Cameras
+from cat3d_core.nerf import Field, render_image
+from cat3d_core.trajectories import RECIPES, Shift, choose_recipe, scene_frame
+from flows import images
+from flows.jobs import Job, Outcome
+from flows.pictures import depth_picture
+from flows.progress import Meter, meter
+from flows.stages.common import read_cameras, views_with_role, write_cameras
+from flows.stages.reconstruct import read_field
+from schemas.content_key import content_key
+from schemas.scene_store import Run, SceneStore, Section
+
+VERSION = 1
+
+
+def execute(job: Job, store: SceneStore, key: str) -> Outcome:
+    """Write `renders/test` and `renders/path`: image, depth, opacity per view, each view recorded when it is done."""
+    run = store.run(job.run)
+    field = read_field(job, run)
+    settings = job.config.render
+    test = views_with_role(store, run, "test") if settings.test_views else []
+    captured = read_cameras(store.captured)
+    jobs = [("test", captured[test], test)] if test else []
+    decisions = [] if test else ["No held-out views to render: this split has none."]
+    if settings.path != "none":
+        path = camera_path(job, store, run)
+        jobs.append(("path", path, list(range(len(path)))))
+    total = sum(len(cameras) for _, cameras, _ in jobs)
+    rays = 0
+    with meter(f"render {job.scene_id} {job.run}", total) as progress:
+        for kind, cameras, views in jobs:
+            rays += render_views(run.renders(kind), field, cameras, views, content_key(step=key, kind=kind), progress)
+    write_pictures(job, run, test)
+    return Outcome({"views": total, "rays": rays}, decisions)
+
+
+def render_views(
+    section: Section, field: Field, cameras: Cameras, views: list[int], key: str, progress: Meter
+) -> int:
+    """Render the cameras that are not done yet under `key`; the number of rays cast."""
+    width, height = (int(s) for s in cameras.size.max(0).values)
+    section.create_array("image", (len(cameras), height, width, 3))
+    section.create_array("depth", (len(cameras), height, width))
+    section.create_array("opacity", (len(cameras), height, width))
+    section.create_array("done", (len(cameras), 32))
+    write_cameras(section, cameras)
+    section.write("view", np.array(views, np.int32))
+    keys = [content_key(step=key, view=view) for view in views]
+    done = section.done("done", keys, data=["image", "depth"])
+    rays = 0
+    for i in range(len(cameras)):
+        if done[i]:
+            progress.advance()
+            continue
+        out = render_image(field, cameras.to(dtype=torch.float32), i)
+        section.write_images("image", [images.to_uint8(out.image)], [i])
+        for name, values in (("depth", out.depth), ("opacity", out.opacity)):
+            padded = np.zeros((1, height, width), np.float32)
+            padded[0, : values.shape[0], : values.shape[1]] = values.cpu().numpy()
+            section.write_views(name, padded, [i])
+        section.mark_done("done", [keys[i]], [i])
+        rays += out.depth.numel()
+        progress.advance()
+    return rays
+
+
+def camera_path(job: Job, store: SceneStore, run: Run) -> Cameras:
+    """The cameras of the video: the curve of the recipe that suits the training views, unshifted, seen through the
+    first training view's lens."""
+    train = read_cameras(store.captured, views_with_role(store, run, "train"))
+    points = torch.from_numpy(store.captured.read("points")).double() if "points" in store.captured else None
+    frame = scene_frame(train, points)
+    recipe, _ = choose_recipe(train, frame, points)
+    poses = RECIPES[recipe].curve(frame, train, job.config.render.path_views, Shift())
+    first = train[0]
+    return Cameras(first.intrinsics.expand(len(poses), 3, 3), poses, first.size.expand(len(poses), 2))
+
+
+def write_pictures(job: Job, run: Run, test: list[int]) -> None:
+    """Write the renders as PNG files and the path as mp4 videos (colour, depth) into the run's folder of pictures."""
+    job.pictures.mkdir(parents=True, exist_ok=True)
+    if test:
+        section = run.renders("test")
+        for i, view in enumerate(test):
+            images.write_png(job.pictures / f"test_{view:04d}.png", section.read_image("image", i))
+            depth = section.read_image("depth", i)
+            images.write_png(job.pictures / f"test_{view:04d}_depth.png", depth_picture(depth))
+    if job.config.render.path == "none":
+        return
+    section = run.renders("path")
+    frames = range(section.shape("image")[0])
+    fps = job.config.render.fps
+    images.write_video(job.pictures / "path.mp4", (section.read_image("image", i) for i in frames), fps)
+    near, far = _depth_range(section)
+    depths = (depth_picture(section.read_image("depth", i), near, far) for i in frames)
+    images.write_video(job.pictures / "path_depth.mp4", depths, fps)
+
+
+def _depth_range(section: Section) -> tuple[float, float]:
+    """One range for the whole video, so that colours do not flicker."""
+    depth = section.read("depth")
+    inside = depth[depth > 0]
+    return tuple(np.quantile(inside, [0.01, 0.95]).tolist()) if inside.size else (0.1, 1.0)
