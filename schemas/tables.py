@@ -6,6 +6,7 @@ A value that doesn't apply or wasn't measured is null.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import uuid
 from collections.abc import Mapping, Sequence
@@ -18,6 +19,9 @@ import pyarrow.parquet as pq
 from schemas.documents import sync_folder
 from schemas.errors import StoreError
 from schemas.section import checked_name
+
+#: Entry of a file's metadata that holds the checksum of its rows; files of other programs have none.
+SEAL = b"rows_sha256"
 
 
 def _field(name: str, kind: pa.DataType, meaning: str, unit: str = "", required: bool = False) -> pa.Field:
@@ -95,6 +99,7 @@ def append_rows(folder: str | Path, schema: pa.Schema, rows: Sequence[Mapping[st
         table = pa.Table.from_pylist([dict(row) for row in rows], schema=schema)
     except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
         raise StoreError(f"The rows for {path} don't fit the schema: {error}.") from error
+    table = table.replace_schema_metadata({**(schema.metadata or {}), SEAL: _digest(table)})
     folder.mkdir(parents=True, exist_ok=True)
     temporary = folder / f".{path.name}.{uuid.uuid4().hex}.partial"  # readers pass over names that start with a dot
     try:
@@ -130,6 +135,16 @@ def read_rows(folder: str | Path, schema: pa.Schema | None = None) -> pa.Table:
 
 def _read_file(path: Path) -> pa.Table:
     try:
-        return pq.ParquetFile(path, page_checksum_verification=True).read()
-    except (pa.ArrowException, OSError) as error:
+        table = pq.ParquetFile(path, page_checksum_verification=True).read()
+        metadata = dict(table.schema.metadata or {})
+        sealed = metadata.pop(SEAL, None)
+        if sealed is not None and sealed != _digest(table):
+            raise pa.ArrowInvalid("its rows don't match their checksum")
+    except (pa.ArrowException, OSError, ValueError) as error:
         raise StoreError(f"{path} is damaged: {error}. Remove it and evaluate again.") from error
+    return table.replace_schema_metadata(metadata)
+
+
+def _digest(table: pa.Table) -> bytes:
+    """Checksum of names and values: Parquet's own are of the pages, not of the footer that says what they mean."""
+    return hashlib.sha256(repr(table.to_pydict()).encode()).hexdigest().encode()

@@ -92,7 +92,7 @@ def test_tables_that_do_not_go_together(tmp_path: Path) -> None:
         read_rows(tmp_path)
 
 
-def test_damaged_pages_are_found(tmp_path: Path) -> None:
+def test_no_damage_changes_a_row(tmp_path: Path) -> None:
     path = append_rows(tmp_path, METRICS, [metric(i, ssim=i / 7) for i in range(200)], "fox")
     good = path.read_bytes()
     rows = read_rows(tmp_path).to_pylist()
@@ -100,18 +100,11 @@ def test_damaged_pages_are_found(tmp_path: Path) -> None:
         path.write_bytes(good[:size])
         with pytest.raises(StoreError, match="fox.parquet is damaged"):
             read_rows(tmp_path)
-    first, last = _pages(path, good)
-    for position in random.Random(0).sample(range(first, last), 60):
+    for position in random.Random(0).sample(range(len(good)), 300):  # pages, their headers and the footer
         bad = bytearray(good)
         bad[position] ^= 1 << (position % 8)
         path.write_bytes(bad)
         try:
-            assert read_rows(tmp_path).to_pylist() == rows  # e.g. statistics in a page's header
+            assert read_rows(tmp_path).to_pylist() == rows  # statistics, the meaning of a column, padding
         except StoreError as error:
             assert "fox.parquet is damaged" in str(error)  # noqa: PT017
-
-
-def _pages(path: Path, good: bytes) -> tuple[int, int]:
-    """Where the pages of the table begin and end in the file; what follows is the footer, which has no checksum."""
-    path.write_bytes(good)
-    return 4, len(good) - 8 - int.from_bytes(good[-8:-4], "little")
