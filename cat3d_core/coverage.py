@@ -3,9 +3,10 @@
 Definition. The volume is a cube about the scene's centre, upright, with a side of 1.5 times the mean distance of the
 captured cameras; where scene points are known, only the voxels that hold some of them (and their neighbours) count,
 else all of them. A voxel is seen by a view when its middle projects into the image at positive depth; there is no
-occlusion test (sparse points cannot give one). Directions from voxel to camera are sorted into 128 bins (18 degrees
-wide), the nearest of 128 Fibonacci-sphere directions fixed to the scene's axes. A (voxel, bin) pair is covered when
-some view sees the voxel from that bin. So the measure moves with the world and has no unit.
+occlusion test (sparse points cannot give one). The unit directions from voxel to camera are sorted into 128 bins of
+equal solid angle: 8 equal bands of the upward component times 16 equal sectors of azimuth (bands of equal height on
+the sphere have equal areas). A (voxel, bin) pair is covered when some view sees the voxel from that bin. So the
+measure moves with the world and has no unit.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from torch import Tensor
 from cat3d_core.cameras import Cameras
 from cat3d_core.trajectories.frame import SceneFrame
 
-BINS = 128
+_BANDS, _SECTORS = 8, 16
+BINS = _BANDS * _SECTORS
 _SIDE = 1.5
 _NONE = -1
 
@@ -50,24 +52,23 @@ def voxel_grid(frame: SceneFrame, points: Tensor | None = None, resolution: int 
 
 def direction_bins(cameras: Cameras, frame: SceneFrame, voxels: Tensor) -> Tensor:
     """(N, K) int64: the bin that view n sees voxel k from, or -1 where it does not see it."""
-    sphere = fibonacci_sphere(BINS).to(voxels)
     out = []
     for i in range(0, len(cameras), 32):
         some = cameras[slice(i, i + 32)]
         pixels, depth = some.project(voxels)
         seen = (depth > 0) & (pixels >= 0).all(-1) & (pixels <= some.size[:, None].to(pixels)).all(-1)
         toward = (some.centers[:, None] - voxels[None]) @ frame.axes.T
-        out.append(torch.where(seen, (toward @ sphere.T).argmax(-1), _NONE))
+        out.append(torch.where(seen, bin_of(toward), _NONE))
     return torch.cat(out) if out else torch.zeros(0, len(voxels), dtype=torch.long)
 
 
-def fibonacci_sphere(count: int) -> Tensor:
-    """(count, 3) nearly even unit directions (golden-angle spiral)."""
-    i = torch.arange(count, dtype=torch.float64)
-    z = 1 - (2 * i + 1) / count
-    angle = torch.pi * (3 - 5**0.5) * i
-    r = (1 - z * z).sqrt()
-    return torch.stack([r * angle.cos(), r * angle.sin(), z], -1)
+def bin_of(directions: Tensor) -> Tensor:
+    """(...) int64 bin of directions (..., 3) in right, ahead, up axes; they need not have unit length."""
+    x, y, z = directions.unbind(-1)
+    height = z / directions.norm(dim=-1).clamp(min=1e-300)
+    band = ((height + 1) / 2 * _BANDS).long().clamp(0, _BANDS - 1)
+    sector = ((torch.atan2(y, x) / (2 * torch.pi) + 0.5) * _SECTORS).long().clamp(0, _SECTORS - 1)
+    return band * _SECTORS + sector
 
 
 def coverage(bins: Tensor) -> Coverage:
@@ -92,7 +93,5 @@ def gains(bins: Tensor, given: Tensor | None = None) -> Tensor:
 def _covered(bins: Tensor) -> Tensor:
     """(K, BINS) which pairs any of the views covers."""
     out = torch.zeros(bins.shape[1], BINS + 1, dtype=torch.bool)
-    voxel = torch.arange(bins.shape[1])
-    for row in bins:
-        out[voxel, row] = True  # -1 is the spare last column
+    out[torch.arange(bins.shape[1]).expand_as(bins), bins] = True  # -1 is the spare last column
     return out[:, :BINS]

@@ -113,12 +113,15 @@ def make_plan(
     depth_bounds: Tensor | None = None,
     seed: int = 0,
     frame: SceneFrame | None = None,
+    fit: Cameras | None = None,
 ) -> Plan:
     """Plan the generated views of a scene from its captured cameras (paper, 'Generating Novel Views' and its appendix).
 
     captured: V >= 1 cameras in any one world frame. points (P, 3), depth_bounds (V, 2): what is known of the geometry.
-    frame: centre, up and distance, when they are known better than from the cameras. seed: only thins out more than
-    20,000 points. The plan moves with the world: planning g(captured) gives g(plan) for every similarity g, provided
+    frame: centre, up and distance, when they are known better than from the cameras. fit: cameras (poses only) that
+    the recipe and its circles and ellipses are fitted to, the captured ones by default; the paper takes all views of
+    the training set, also where only three of them are captured views. seed: only thins out more than
+    10,000 points. The plan moves with the world: planning g(captured) gives g(plan) for every similarity g, provided
     the scale is known (two cameras apart, depth, or `frame`). Raises ValueError for no or faulty cameras.
     """
     config = config or PlanConfig()
@@ -127,14 +130,16 @@ def make_plan(
     captured.validate()
     captured = captured.to(device="cpu", dtype=torch.float64)
     points = None if points is None else points.to(device="cpu", dtype=torch.float64)
-    frame = frame or scene_frame(captured, points, depth_bounds, config.pitch_down_deg)
+    fit = captured if fit is None else fit.to(device="cpu", dtype=torch.float64)
+    fit.validate()
+    frame = frame or scene_frame(fit, points, depth_bounds, config.pitch_down_deg)
     if config.trajectory == "auto":
-        name, reasons = choose_recipe(captured, frame, points)
+        name, reasons = choose_recipe(fit, frame, points)
     else:
         name, reasons = config.trajectory, [f"The trajectory {config.trajectory} was asked for."]
     recipe = RECIPES[name].with_shifts(config.scales, config.sides, config.heights, config.forwards)
-    free = FreeSpace.of(captured, frame, points, seed)
-    poses, path, changes = build_trajectory(recipe, frame, captured, free, config.count)
+    free = FreeSpace.of(fit, frame, points, seed)
+    poses, path, changes = build_trajectory(recipe, frame, captured if recipe.from_inputs else fit, free, config.count)
     reasons = reasons + changes
 
     # Coverage is a property of the poses: measured once, on the first sample kind.

@@ -45,8 +45,8 @@ def choose_recipe(captured: Cameras, frame: SceneFrame, points: Tensor | None = 
     center = axes_intersection(captured)
     if center is None:
         return "realestate10k", [
-            f"The viewing directions spread by {spread:.0f} degrees and share no point in front of the cameras, as on "
-            "a walk through a space: spline through the views, shifted sideways and ahead."
+            f"The {len(captured)} captured views look up to {spread:.0f} degrees apart and share no point in front "
+            "of them, as on a walk through a space: splines through them, shifted sideways and ahead."
         ]
     return _around(captured, frame, center, spread)
 

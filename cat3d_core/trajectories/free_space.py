@@ -12,12 +12,12 @@ from cat3d_core.random import generator
 from cat3d_core.trajectories.frame import SceneFrame
 from cat3d_core.view_selection import farthest_points
 
-_MAX_POINTS = 20_000
+_MAX_POINTS = 10_000
 _MAX_VIEWS = 24
 _GRID = 24  # cells per image side of the coarse farthest-depth maps
-_NEIGHBOUR = 5  # the fifth nearest point decides nearness: sparse points have lone outliers
+_NEIGHBOUR = 5  # so many points make a surface: sparse points have lone outliers
 CLEARANCE = 0.12  # least distance from a camera to the surface, in units of the scene's distance
-_BEHIND = 0.5  # how far behind a seen surface still counts as inside it, same unit
+_BEHIND = 0.25  # how far behind a seen surface still counts as inside it, same unit
 _ELEVATION_MARGIN = 12.0  # degrees above and below the captured elevations
 _MAX_ELEVATION = 80.0
 _ADVANCE = 0.5  # how much of the way to the nearest surface a camera may go, for views that look one way
@@ -42,7 +42,7 @@ class FreeSpace:
 
     @staticmethod
     def of(captured: Cameras, frame: SceneFrame, points: Tensor | None, seed: int = 0) -> FreeSpace:
-        """Measure captured views (N) and points (P, 3) or None. More than 20,000 points are sampled by the seed."""
+        """Measure captured views (N) and points (P, 3) or None. More than 10,000 points are sampled by the seed."""
         if points is None:
             points = captured.centers.new_zeros(0, 3)
         if len(points) > _MAX_POINTS:
@@ -65,20 +65,16 @@ class FreeSpace:
     def blocked(self, centers: Tensor) -> Tensor:
         """(N,) whether positions (N, 3) are within CLEARANCE of the surface or inside a seen surface.
 
-        Inside: behind the farthest point of its cell, by less than half the scene's distance, in every captured view
-        that has points there (and one at least has). Without points nothing is blocked.
+        Inside: behind the farthest point of its cell, by less than a quarter of the scene's distance, in every captured
+        view that has points there (and one at least has). Without points nothing is blocked.
         """
         if len(self.points) < _NEIGHBOUR:
             return torch.zeros(len(centers), dtype=torch.bool, device=centers.device)
-        unit = self.frame.distance
-        close = torch.cat(
-            [
-                torch.cdist(c, self.points).kthvalue(_NEIGHBOUR, dim=1).values < CLEARANCE * unit
-                for c in centers.split(64)
-            ]
-        )
+        # Local coordinates: the products inside cdist lose no digits to a far-away world origin.
+        surface, places = self.frame.local(self.points), self.frame.local(centers)
+        close = torch.cat([(torch.cdist(p, surface) < CLEARANCE).sum(1) >= _NEIGHBOUR for p in places.split(64)])
         depth, reach, known = self._compare(centers)
-        inside = known & (depth > reach) & (depth < reach + _BEHIND * unit)
+        inside = known & (depth > reach) & (depth < reach + _BEHIND * self.frame.distance)
         return close | (inside.any(0) & (inside | ~known).all(0))
 
     def unusual(self, centers: Tensor, round_the_scene: bool) -> Tensor:

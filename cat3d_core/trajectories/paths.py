@@ -52,13 +52,13 @@ def ellipse(frame: SceneFrame, cameras: Cameras, n: int, shift: Shift) -> Tensor
     """Level ellipse round the centre fitted to the cameras (paper, mip-NeRF 360 trajectories), equal arc steps.
 
     The conic x^T Q x = 1 fitted by least squares to the level positions (in units of their mean radius), drawn to the
-    circle Q = I by a weight of 0.05, so that two or three cameras, or an arc, give nearly a circle.
+    circle Q = I with the weight of half a camera, so that what few cameras or an arc leave open becomes a circle.
     """
     x, y, height, radius = _level_positions(frame, cameras)
     u, v = x / radius, y / radius
     # Unknowns q = (Q11, Q22, sqrt(2) Q12): the Frobenius norm of Q is then the plain norm of q.
     rows = torch.stack([u * u, v * v, 2**0.5 * u * v], -1) / len(u) ** 0.5
-    prior = 0.05**0.5 * torch.eye(3, dtype=u.dtype)
+    prior = (0.5 / len(u)) ** 0.5 * torch.eye(3, dtype=u.dtype)
     target = torch.cat([torch.full_like(u, len(u) ** -0.5), prior @ prior.new_tensor([1, 1, 0])])
     q = torch.linalg.lstsq(torch.cat([rows, prior]), target[:, None]).solution[:, 0]
 

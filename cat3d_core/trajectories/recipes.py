@@ -31,8 +31,9 @@ class Recipe:
     """A family of paths: one curve, every combination of its scales and shifts.
 
     curve(frame, captured, n, shift) -> poses (n, 4, 4). round_the_scene: views look in from around a centre, else
-    they look one way. looks_at_center: every view's forward axis goes through the scene's centre. sides, heights and
-    forwards are in units of the scene's distance.
+    they look one way. from_inputs: fitted to the input views, where the others are fitted to all views that are known
+    (paper: 'all views in the training set'). looks_at_center: every view's forward axis goes through the scene's
+    centre. sides, heights and forwards are in units of the scene's distance.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Recipe:
     forwards: tuple[float, ...] = (0.0,)
     round_the_scene: bool = False
     looks_at_center: bool = True
+    from_inputs: bool = False
 
     @property
     def shifts(self) -> list[Shift]:
@@ -87,6 +89,7 @@ RECIPES: dict[str, Recipe] = {
             sides=(-0.2, -0.1, 0.0, 0.1, 0.2),
             forwards=(-0.1, 0.1),
             looks_at_center=False,
+            from_inputs=True,
         ),
         Recipe(
             "llff",
@@ -109,6 +112,7 @@ RECIPES: dict[str, Recipe] = {
             scales=(0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4),
             round_the_scene=True,
             looks_at_center=False,
+            from_inputs=True,
         ),
         Recipe(
             "mipnerf360",
@@ -152,10 +156,9 @@ def build_trajectory(
     for number, (shift, n) in enumerate(zip(shifts, amounts, strict=True)):
         if n == 0:
             continue
-        strength, path = _softest_needed(recipe, frame, captured, free, n, shift)
+        strength, path, blocked = _softened(recipe, frame, captured, free, n, shift)
         if strength < 1:
             softened.append(f"{number} (to {strength:.0%})")
-        blocked = free.blocked(path[:, :3, 3])
         if blocked.any():
             moved += int(blocked.sum())
             path = _retreated(recipe, frame, free, path)
@@ -174,21 +177,23 @@ def build_trajectory(
     return torch.cat(all_poses), torch.tensor(numbers), reasons
 
 
-def _softest_needed(
+def _softened(
     recipe: Recipe, frame: SceneFrame, captured: Cameras, free: FreeSpace, n: int, shift: Shift
-) -> tuple[float, Tensor]:
-    """The largest strength of the shift whose path has the fewest offending cameras, and that path."""
-    best: tuple[int, float, Tensor] | None = None
+) -> tuple[float, Tensor, Tensor]:
+    """The largest strength of the shift with the fewest offending cameras, its path, and which of it are blocked."""
+    best: tuple[float, Tensor, Tensor] | None = None
+    fewest = n + 1
     for strength in _STRENGTHS:
         path = recipe.curve(frame, captured, n, shift.softened(strength))
         centers = path[:, :3, 3]
-        faults = int((free.blocked(centers) | free.unusual(centers, recipe.round_the_scene)).sum())
-        if best is None or faults < best[0]:
-            best = (faults, strength, path)
+        blocked = free.blocked(centers)
+        faults = int((blocked | free.unusual(centers, recipe.round_the_scene)).sum())
+        if faults < fewest:
+            fewest, best = faults, (strength, path, blocked)
         if faults == 0 or shift == Shift():
             break
     assert best is not None
-    return best[1], best[2]
+    return best
 
 
 def _retreated(recipe: Recipe, frame: SceneFrame, free: FreeSpace, path: Tensor) -> Tensor:
