@@ -41,11 +41,6 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
         views = list(pool.map(one, range(count)))
     write_captured(store, capture, views)
     decisions = list(capture.notes)
-    if capture.missing:
-        decisions.append(
-            f"{len(capture.missing)} listed frames have no image and were left out: "
-            + ", ".join(capture.missing[:5]) + (" ..." if len(capture.missing) > 5 else "")
-        )  # fmt: skip
     if capture.distortion is not None and capture.distortion.any():
         decisions.append("The images were undistorted; the stored intrinsics are those of the pinhole images.")
     pixels = sum(v.image.shape[0] * v.image.shape[1] for v in views)
