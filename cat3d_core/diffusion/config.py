@@ -183,7 +183,7 @@ SIZES: dict[str, ModelConfig] = {
             channels=(96, 192),
             blocks=1,
             attention=(True, True),
-            heads=(3, 6),
+            heads=(2, 3),
             max_3d_size=64,
             cross_attention_dim=192,
         ),

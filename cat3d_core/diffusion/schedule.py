@@ -51,8 +51,8 @@ class Schedule:
         trailing: steps T-1, T-1-T/n, ... (Lin et al. 2023); linspace: from step T-1 to 0; log_snr: uniform in log-SNR over
         the table's range; karras: uniform in (sigma/alpha)^(1/7) (Karras et al. 2022). The last three end at step 0.
         """
-        if steps < 2:
-            raise ValueError(f"Sampling needs at least 2 steps, not {steps}.")
+        if steps < 3:
+            raise ValueError(f"Sampling needs at least 3 steps, not {steps}.")
         table, count = self.log_snr, self.config.steps
         if kind == "trailing":
             index = torch.arange(steps, dtype=torch.float64) * (-count / steps) + count
