@@ -6,12 +6,14 @@ Optional settings follow a question mark: procedural:llff/3?views=24&width=128&h
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 from pathlib import Path
 from urllib.parse import parse_qsl
 
 import numpy as np
 
-from cat3d_core.synthetic import random_cameras, random_scene, trace
+from cat3d_core.cameras import Cameras
+from cat3d_core.synthetic import Traced, random_cameras, random_scene, trace
 from flows.images import to_uint8
 from flows.readers import splits
 from flows.readers.base import Capture, InputError
@@ -36,12 +38,9 @@ def read(path: Path | str, image_folder: str | None, view_counts: tuple[int, ...
         raise InputError(f"{path} is not of the form procedural:FAMILY/SEED, for example procedural:llff/3.")
     family, seed, settings = match.group(1), int(match.group(2)), _settings(str(path), match.group(3) or "")
     try:
-        scene = random_scene(family, seed)
-        cameras = random_cameras(scene, seed, settings["views"], settings["width"], settings["height"])
+        cameras, traced = _traced(family, seed, **settings)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
-    # View by view: a batch of all views at once needs memory for all their rays.
-    traced = [trace(scene, cameras, view) for view in range(len(cameras))]
     return Capture(
         scene_id=f"procedural_{family}_{seed}",
         dataset=FAMILY_NAMES.get(family, family),
@@ -52,6 +51,14 @@ def read(path: Path | str, image_folder: str | None, view_counts: tuple[int, ...
         splits=splits.every_8th(len(cameras), view_counts),
         notes=[splits.EVERY_8TH],
     )
+
+
+@lru_cache(maxsize=2)  # a spec never changes its meaning, and several stages of a run read it
+def _traced(family: str, seed: int, views: int, width: int, height: int) -> tuple[Cameras, list[Traced]]:
+    scene = random_scene(family, seed)
+    cameras = random_cameras(scene, seed, views, width, height)
+    # View by view: a batch of all views at once needs memory for all their rays.
+    return cameras, [trace(scene, cameras, view) for view in range(len(cameras))]
 
 
 def _settings(spec: str, query: str) -> dict[str, int]:
