@@ -143,8 +143,8 @@ def _too_few(placed: list[int], names: list[str], needed: int) -> str:
     return (
         f"Only {len(placed)} of {len(names)} photos could be placed{who}; at least {needed} are needed. What helps: "
         "more photos with smaller steps between them (neighbours should share two thirds of what they show), a "
-        "textured and unmoving scene, sharp photos from one camera at one zoom; or give the cameras (transforms.json or a "
-        "COLMAP model)."
+        "textured and unmoving scene, sharp photos from one camera at one zoom; or give the cameras "
+        "(transforms.json or a COLMAP model)."
     )
 
 
