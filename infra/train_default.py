@@ -1,15 +1,14 @@
 """Train the default model from nothing but procedural scenes and a folder of free photographs.
 
-    python infra/train_default.py photos  WORK --folder PHOTOS     # squares of the photographs -> WORK/photos.safetensors
-    python infra/train_default.py render  WORK --scenes 3500       # shards of rendered scenes  -> WORK/renders/
+    python infra/train_default.py photos WORK --folder PHOTOS      # squares of them -> WORK/photos.safetensors
+    python infra/train_default.py render WORK --scenes 3500        # shards of rendered scenes  -> WORK/renders/
     python infra/train_default.py autoencoder WORK --minutes 15    # -> WORK/autoencoder.safetensors
-    python infra/train_default.py encode  WORK                     # latents of all shards      -> WORK/latents/
-    python infra/train_default.py train   WORK --until 05:25       # -> WORK/state.safetensors, WORK/model.safetensors
-    python infra/train_default.py export  WORK                     # EMA, float16 -> cat3d_core/weights/
+    python infra/train_default.py encode WORK                      # latents of all shards      -> WORK/latents/
+    python infra/train_default.py train WORK --until 05:25         # -> WORK/state.safetensors, WORK/model.safetensors
+    python infra/train_default.py export WORK --scenes 20          # -> cat3d_core/weights/, numbers on the model card
 
-Every step continues where it was stopped. `--device cuda` runs the same on a GPU, in legs of `--minutes`; `pack` and
-`unpack` carry WORK's results between machines in parts under 16 MiB. Needs torch, numpy and safetensors
-(`photos` also OpenImageIO).
+Every step continues where it was stopped. `--device cuda` runs the same on a GPU, in legs of `--minutes`. Needs torch,
+numpy and safetensors; `photos` and `export` need the rest of the package.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -26,37 +26,30 @@ from torch import Tensor
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.diffusion import (
+    SIZES,
     Autoencoder,
-    AutoencoderConfig,
     LatentBank,
     ModelConfig,
     MultiViewModel,
-    ScheduleConfig,
     TrainConfig,
     Trainer,
-    UNetConfig,
     autoencoder_loss,
+    describe,
+    load_model,
     load_state,
     save_model,
     save_state,
 )
-from cat3d_core.normalization import normalize_scene
 from cat3d_core.random import derive_seed, generator
-from cat3d_core.synthetic import FAMILIES, random_cameras, random_scene, render_views, trace
+from cat3d_core.synthetic import FAMILIES
+from cat3d_core.synthetic.dataset import Capture, mirrored, recoloured, training_capture
 
-# Small enough for a CPU: 64-pixel images, 8x8x8 latents, two levels, 3D attention at both.
-DEFAULT = ModelConfig(
-    UNetConfig(
-        latent_size=8, channels=(96, 192), blocks=1, attention=(True, True), heads=(3, 6), max_3d_size=64,
-        cross_attention_dim=192,
-    ),
-    AutoencoderConfig(widths=(32, 64, 128), blocks=(1, 1, 1)),
-    ScheduleConfig(base="cosine"),
-)  # fmt: skip
+# Fourier features of the rays: in a short training they make up for much of what a long one would learn.
+DEFAULT = replace(SIZES["small"], unet=replace(SIZES["small"].unet, ray_octaves=3))
 HELD_OUT_PHOTOS = 6
 VIEWS = 16
 SHARD_SCENES = 25
-PART_BYTES = 15 << 20
+START, END = "<!-- numbers: written by infra/train_default.py export -->", "<!-- end of numbers -->"
 
 
 def log(work: Path, **record: object) -> None:
@@ -97,43 +90,6 @@ def training_photos(work: Path) -> Tensor:
     return load_file(work / "photos.safetensors")["photos"][:-HELD_OUT_PHOTOS].float() / 255
 
 
-def render_scene(family: str, seed: int, textures: Tensor, size: int, device: str) -> dict[str, Tensor]:
-    """One scene: images (V, 3, H, W) uint8 and its normalised cameras."""
-    scene = random_scene(family, seed, textures)
-    spread = generator(seed, "spread")
-    wide = 0.35 + 0.65 * float(torch.rand((), generator=spread))
-    cameras = random_cameras(scene, seed, VIEWS, size, size, spread=wide)
-    scene = scene.to(device)
-    image = render_views(scene, cameras.to(device, torch.float32))[0]
-    # As in use, where some captures come with sparse points and some don't.
-    points = None
-    if torch.rand((), generator=spread) < 0.7:
-        points = surface_points(trace_coarse(scene, cameras), cameras)
-    normal = normalize_scene(cameras, points).cameras(cameras)
-    return {
-        "image": (image * 255).round().to(torch.uint8).cpu(),
-        "intrinsics": normal.intrinsics.float(),
-        "world_from_camera": normal.world_from_camera.float(),
-    }
-
-
-def trace_coarse(scene, cameras: Cameras, side: int = 12) -> Tensor:
-    """(V, side, side) z-depth on a coarse grid."""
-    return trace(scene, cameras.resize(side, side), supersample=1).depth.cpu()
-
-
-def surface_points(depth: Tensor, cameras: Cameras) -> Tensor:
-    """(P, 3) float64 world points of all finite depths (V, h, w)."""
-    height, width = depth.shape[-2:]
-    small = cameras.resize(width, height)
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    grid = torch.stack([x, y, torch.ones_like(x)]).double().reshape(3, -1)
-    directions = small.rotation @ torch.linalg.inv(small.intrinsics) @ grid
-    z = depth.reshape(len(depth), 1, -1).double()
-    points = (small.centers[:, :, None] + directions * z).permute(0, 2, 1).reshape(-1, 3)
-    return points[z.reshape(-1).isfinite()]
-
-
 def render(work: Path, scenes: int, size: int, rank: int, ranks: int, device: str) -> None:
     """Shards of SHARD_SCENES scenes, families in turn. Shard n holds scenes n * SHARD_SCENES onwards."""
     textures = training_photos(work)
@@ -147,7 +103,8 @@ def render(work: Path, scenes: int, size: int, rank: int, ranks: int, device: st
             for attempt in range(10):
                 try:
                     seed = derive_seed(1, "training scene", number, attempt) & 0x7FFFFFFF
-                    parts.append(render_scene(FAMILIES[number % len(FAMILIES)], seed, textures, size, device))
+                    family = FAMILIES[number % len(FAMILIES)]
+                    parts.append(as_tensors(training_capture(family, seed, VIEWS, size, textures, device)))
                     break
                 except ValueError:  # no free place for the cameras: the next seed
                     continue
@@ -192,7 +149,7 @@ def reconstruction_psnr(autoencoder: Autoencoder, images: Tensor) -> float:
 
 def train_autoencoder(work: Path, config: ModelConfig, minutes: float, device: str) -> None:
     """Continue for `minutes`; the learning rate falls to its end over that time."""
-    size, batch, peak = config.image_size, 16, 2e-3
+    size, batch, peak = config.image_size, 16, 2.5e-3
     everything = load_file(work / "photos.safetensors")["photos"].float() / 255
     held_out = photo_crops(everything[-HELD_OUT_PHOTOS:], 64, size, generator(9, "held-out crops"))
     pictures = everything[:-HELD_OUT_PHOTOS]
@@ -202,10 +159,9 @@ def train_autoencoder(work: Path, config: ModelConfig, minutes: float, device: s
     if path.exists():
         model.load_state_dict(load_file(path))
     optimizer = torch.optim.AdamW(model.parameters(), lr=peak, betas=(0.9, 0.99), weight_decay=1e-3)
-    average = torch.optim.swa_utils.AveragedModel(model, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.998))
     start, step, random = time.time(), 0, generator(int(time.time()), "autoencoder")
     while (passed := (time.time() - start) / 60 / minutes) < 1:
-        rate = peak * min(1.0, (step + 1) / 100) * (1 - passed) ** 0.7
+        rate = peak * min(1.0, (step + 1) / 60) * (1 - passed) ** 0.8
         optimizer.param_groups[0]["lr"] = rate
         images = autoencoder_batch(pictures, renders, batch, size, random).to(device)
         with torch.autocast(device, torch.bfloat16):
@@ -215,15 +171,13 @@ def train_autoencoder(work: Path, config: ModelConfig, minutes: float, device: s
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimizer.step()
-        average.update_parameters(model)
         step += 1
         if step % 200 == 0:
-            test = reconstruction_psnr(average.module, held_out.to(device))
+            test = reconstruction_psnr(model, held_out.to(device))
             log(work, step="autoencoder", n=step, lr=round(rate, 6), held_out_psnr=round(test, 2), **rounded(record))
-    final = average.module
-    final.calibrate(autoencoder_batch(pictures, renders, 1024, size, random).to(device))
-    save(path, {k: t.cpu() for k, t in final.state_dict().items()})
-    photo, scene = reconstruction_psnr(final, held_out.to(device)), reconstruction_psnr(final, renders[-256:] / 255.0)
+    model.calibrate(autoencoder_batch(pictures, renders, 1024, size, random).to(device))
+    save(path, {k: t.cpu() for k, t in model.state_dict().items()})
+    photo, scene = reconstruction_psnr(model, held_out.to(device)), reconstruction_psnr(model, renders[-256:] / 255.0)
     log(work, step="autoencoder done", n=step, held_out_psnr=round(photo, 2), renders_psnr=round(scene, 2))
 
 
@@ -231,9 +185,26 @@ def rounded(record: dict[str, float]) -> dict[str, float]:
     return {k: float(f"{v:.4g}") for k, v in record.items()}
 
 
+def as_tensors(capture: Capture) -> dict[str, Tensor]:
+    return {
+        "image": (capture.image * 255).round().to(torch.uint8),
+        "intrinsics": capture.cameras.intrinsics.float(),
+        "world_from_camera": capture.cameras.world_from_camera.float(),
+    }
+
+
+def variants(shard: dict[str, Tensor], scene: int, name: str) -> list[Capture]:
+    """Scene number `scene` of a shard as rendered, recoloured and mirrored, and recoloured."""
+    image, k, pose = (shard[key][scene] for key in ("image", "intrinsics", "world_from_camera"))
+    size = torch.tensor([image.shape[-1], image.shape[-2]]).repeat(len(image), 1)
+    capture = Capture(image.float() / 255, Cameras(k, pose, size))
+    random = generator(scene, "variant", name)
+    return [capture, mirrored(recoloured(capture, random)), recoloured(capture, random)]
+
+
 @torch.no_grad()
 def encode(work: Path, config: ModelConfig, device: str) -> None:
-    """Latents of every rendered shard that has none yet."""
+    """Latents of every rendered shard that has none yet, in three variants of each scene."""
     autoencoder = Autoencoder(config.autoencoder)
     autoencoder.load_state_dict(load_file(work / "autoencoder.safetensors"))
     autoencoder = autoencoder.to(device).eval()
@@ -241,10 +212,16 @@ def encode(work: Path, config: ModelConfig, device: str) -> None:
         target = work / "latents" / path.name
         if target.exists():
             continue
-        shard = load_file(path)
-        images = shard.pop("image")
-        latents = [autoencoder.encode(views.to(device).float() / 255).cpu().half() for views in images]
-        save(target, {"latents": torch.stack(latents), **shard})
+        shard, parts, family = load_file(path), [], []
+        for scene in range(len(shard["family"])):
+            for capture in variants(shard, scene, path.name):
+                latents = autoencoder.encode(capture.image.to(device)).cpu().half()
+                parts.append({"latents": latents, **{k: t for k, t in as_tensors(capture).items() if k != "image"}})
+                family.append(shard["family"][scene])
+        save(
+            target, {name: torch.stack([p[name] for p in parts]) for name in parts[0]} | {"family": torch.stack(family)}
+        )
+    log(work, step="encode", shards=len(shards(work, "latents")))
 
 
 def load_bank(work: Path, config: ModelConfig) -> LatentBank:
@@ -267,9 +244,7 @@ def train(work: Path, config: ModelConfig, until: float, groups: int, peak: floa
     """Train to the clock: learning rate and camera spread follow the time passed of the whole run (start kept in
     WORK/clock.json), because on a borrowed machine time, not steps, is what is given."""
     model = new_model(work, config)
-    settings = TrainConfig(
-        learning_rate=peak, final_learning_rate=peak, warmup_steps=150, ema_decay=0.999, min_snr_gamma=5.0
-    )
+    settings = TrainConfig(learning_rate=peak, final_learning_rate=peak, warmup_steps=150, ema_decay=0.998)
     trainer = Trainer(settings, model, seed, device)
     state_path, clock_path = work / "state.safetensors", work / "clock.json"
     if state_path.exists():
@@ -303,14 +278,14 @@ def train(work: Path, config: ModelConfig, until: float, groups: int, peak: floa
 
 def set_learning_rate(trainer: Trainer, rate: float) -> None:
     """The trainer's own schedule counts steps; this one counts time, so the constant is replaced as it goes."""
-    import dataclasses
-
-    trainer.config = dataclasses.replace(trainer.config, learning_rate=rate, final_learning_rate=rate)
+    trainer.config = replace(trainer.config, learning_rate=rate, final_learning_rate=rate)
 
 
 def new_model(work: Path, config: ModelConfig) -> MultiViewModel:
     torch.manual_seed(0)
     model = MultiViewModel(config)
+    # From scratch there is no pretrained network to start as: let the rays in from the first step.
+    torch.nn.init.kaiming_uniform_(model.unet.conv_in.weight, a=5**0.5)
     model.autoencoder.load_state_dict(load_file(work / "autoencoder.safetensors"))
     return model
 
@@ -326,6 +301,28 @@ def save_training(work: Path, trainer: Trainer, clock: dict) -> None:
     (work / "clock.json").write_text(json.dumps(clock))
 
 
+def export(work: Path, scenes: int) -> None:
+    """Ship the averaged weights in float16, evaluate them on held-out scenes, put the numbers on the model card."""
+    from cat3d_core.weights import default_model_path
+    from flows.bench.model import evaluate_file
+
+    clock = json.loads((work / "clock.json").read_text())
+    source = describe(work / "model.safetensors")["provenance"]
+    root = Path(__file__).resolve().parents[1]
+    target = root / "cat3d_core" / "weights" / "default.safetensors"
+    digest = save_model(target, load_model(work / "model.safetensors"), source, torch.float16)
+    tables = evaluate_file(default_model_path(), scenes, pictures=work / "pictures")
+    card = root / "docs" / "model_card.md"
+    head, _, rest = card.read_text().partition(START)
+    facts = (
+        f"Exported {time.strftime('%Y-%m-%d %H:%M')}; {clock['groups']:,} groups of 8 views seen in "
+        f"{source['steps']:,} steps, {source['hours']} hours; file {target.stat().st_size / 1e6:.1f} MB; "
+        f"SHA-256 of the weights `{digest}`."
+    )
+    card.write_text(f"{head}{START}\n{facts}\n\n{tables}\n{END}{rest.partition(END)[2]}")
+    log(work, step="export", sha256=digest, **clock)
+
+
 def clock_time(text: str) -> float:
     """Seconds since the epoch of the next HH:MM by this machine's clock."""
     now = time.localtime()
@@ -336,16 +333,16 @@ def clock_time(text: str) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("step", choices=["photos", "render", "autoencoder", "encode", "train"])
+    parser.add_argument("step", choices=["photos", "render", "autoencoder", "encode", "train", "export"])
     parser.add_argument("work", type=Path, help="folder for everything that is made (outside the repository)")
     parser.add_argument("--folder", type=Path, help="photographs (photos)")
-    parser.add_argument("--scenes", type=int, default=3500)
+    parser.add_argument("--scenes", type=int, default=3500, help="to render, or to evaluate on per family")
     parser.add_argument("--rank", type=int, default=0)
     parser.add_argument("--ranks", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=15.0)
     parser.add_argument("--until", type=clock_time, help="HH:MM (train)")
-    parser.add_argument("--groups", type=int, default=8, help="groups of 8 views in a batch")
-    parser.add_argument("--learning-rate", type=float, default=6e-4)
+    parser.add_argument("--groups", type=int, default=4, help="groups of 8 views in a batch")
+    parser.add_argument("--learning-rate", type=float, default=5e-4)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
@@ -363,6 +360,8 @@ def main() -> None:
     elif options.step == "train":
         until = options.until or time.time() + 60 * options.minutes
         train(work, config, until, options.groups, options.learning_rate, device)
+    elif options.step == "export":
+        export(work, options.scenes)
 
 
 if __name__ == "__main__":

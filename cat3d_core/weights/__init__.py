@@ -1,0 +1,16 @@
+"""The default model that is shipped with the package. See README.md beside this file for what it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def default_model_path() -> Path:
+    """The shipped model's file. Raises FileNotFoundError in a checkout or build that lacks it."""
+    path = Path(__file__).with_name("default.safetensors")
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"This installation carries no default model ({path} is missing): install the package again, train one "
+            "with infra/train_default.py, or name a model file."
+        )
+    return path

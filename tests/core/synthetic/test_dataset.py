@@ -1,0 +1,52 @@
+"""Training captures: normalised cameras that explain the pictures, and variants that stay consistent."""
+
+import pytest
+import torch
+
+from cat3d_core.rays import image_rays
+from cat3d_core.synthetic import FAMILIES, random_cameras, random_scene, trace
+from cat3d_core.synthetic.dataset import mirrored, recoloured, surface_points, training_capture
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_captures_are_seeded_and_normalised(family):
+    one, same = (training_capture(family, 11, 4, 16) for _ in range(2))
+    assert torch.equal(one.image, same.image)
+    assert one.image.shape == (4, 3, 16, 16)
+    one.cameras.validate()
+    assert 0.2 < float(one.cameras.centers.norm(dim=-1).median()) < 5
+
+
+def test_mirroring_twice_is_nothing_and_once_is_rigid():
+    capture = training_capture("co3d", 3, 3, 16)
+    once, twice = mirrored(capture), mirrored(mirrored(capture))
+    once.cameras.validate()
+    torch.testing.assert_close(twice.cameras.world_from_camera, capture.cameras.world_from_camera)
+    torch.testing.assert_close(twice.cameras.intrinsics, capture.cameras.intrinsics)
+    assert torch.equal(twice.image, capture.image)
+
+
+def test_the_mirrored_ray_of_the_mirrored_pixel_is_the_mirrored_ray():
+    capture = training_capture("llff", 3, 2, 8)
+    flipped = mirrored(capture)
+    for view in range(2):
+        here, there = image_rays(capture.cameras, view), image_rays(flipped.cameras, view)
+        negate = torch.tensor([-1.0, 1, 1], dtype=torch.float64)
+        own = here.directions.reshape(8, 8, 3).flip(1).reshape(-1, 3)
+        torch.testing.assert_close(there.directions, own * negate)
+        torch.testing.assert_close(there.origins, here.origins * negate)
+
+
+def test_recolouring_permutes_channels():
+    capture = training_capture("dtu", 3, 2, 8)
+    out = recoloured(capture, torch.Generator().manual_seed(0)).image
+    torch.testing.assert_close(out.sort(1).values, capture.image.sort(1).values)
+
+
+def test_surface_points_project_onto_their_depth():
+    scene = random_scene("mip360", 2)
+    cameras = random_cameras(scene, 0, 3, 24, 24)
+    depth = trace(scene, cameras, supersample=1).depth
+    points = surface_points(depth[:1], cameras[0])
+    _, z = cameras[0].project(points)
+    torch.testing.assert_close(z[0], depth[0][depth[0].isfinite()].double())
