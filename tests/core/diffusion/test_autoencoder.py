@@ -42,15 +42,16 @@ def test_kl_term_is_the_closed_form():
 
 
 def test_it_learns():
+    """Two pictures by heart: some 10 dB in 100 steps."""
     torch.manual_seed(0)
     autoencoder = Autoencoder(SIZES["tiny"].autoencoder)
-    optimizer = torch.optim.AdamW(autoencoder.parameters(), 2e-3)
-    g = torch.Generator().manual_seed(0)
+    optimizer = torch.optim.AdamW(autoencoder.parameters(), 4e-3)
+    images, noise = _pictures(2), torch.zeros(2, 8, 4, 4)
     history = []
-    for step in range(60):
-        loss, numbers = autoencoder_loss(autoencoder, _pictures(8, seed=step), torch.randn(8, 8, 4, 4, generator=g))
+    for _ in range(100):
+        loss, numbers = autoencoder_loss(autoencoder, images, noise)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         history.append(numbers["psnr"])
-    assert history[-1] > history[0] + 5 and history[-1] > 18
+    assert history[-1] > history[0] + 8
