@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -54,52 +55,67 @@ def _around(focus: Tensor, azimuth: Tensor, elevation: Tensor, distance: Tensor)
     return focus + distance[:, None] * torch.stack([azimuth.cos() * flat, azimuth.sin() * flat, elevation.sin()], -1)
 
 
-def _place(family: str, focus: Tensor, reach: float, style: dict, u: Tensor, draw: _Draw, spread: float):
+@dataclass(frozen=True)
+class _Style:
+    """What all cameras of one capture share. Angles in radians; start, bend, end (3,): a walk's control points."""
+
+    azimuth: float
+    rise: float
+    tilt: float
+    sway: float
+    yaw: float
+    turn: float
+    start: Tensor
+    bend: Tensor
+    end: Tensor
+
+
+def _random_style(draw: _Draw, extent: Tensor) -> _Style:
+    azimuth, rise, tilt, sway, yaw, turn, lean, reach = draw(8, 0, 1).tolist()
+    yaw = 2 * math.pi * yaw
+    ahead = torch.tensor([math.cos(yaw), math.sin(yaw), 0.0], dtype=torch.float64)
+    aside = torch.tensor([-math.sin(yaw), math.cos(yaw), 0.0], dtype=torch.float64)
+    room = extent[:2].min()
+    # Walk mostly forward, from the wall behind towards the middle.
+    drift = 0.5 * (lean - 0.5) * extent.min() * aside
+    start = -0.75 * ahead * room + drift
+    end = (-0.1 + 0.3 * reach) * ahead * room - drift
+    return _Style(
+        azimuth=2 * math.pi * azimuth, rise=-0.05 + 0.45 * rise, tilt=0.25 + 0.3 * tilt, sway=1.0 + float(sway > 0.5),
+        yaw=yaw, turn=1.6 * (turn - 0.5), start=start, end=end,
+        bend=0.5 * (start + end) + 0.25 * (sway - 0.5) * aside * room,
+    )  # fmt: skip
+
+
+def _place(
+    family: str, focus: Tensor, reach: float, style: _Style, u: Tensor, draw: _Draw, spread: float
+) -> tuple[Tensor, Tensor]:
     """Centres and targets (N, 3) at positions u (N,) in [0, 1] along the family's path."""
     count = len(u)
     jitter = torch.stack([draw(count, -1, 1) for _ in range(3)], -1)
     if family == "llff":
         angle, radius = draw(count, 0, 2 * math.pi), draw(count, 0, 1).sqrt() * 0.35 * reach * spread
         offset = torch.stack([radius * angle.cos(), 0.08 * reach * jitter[:, 1], 0.6 * radius * angle.sin()], -1)
-        home = focus + reach * torch.tensor([0.0, -1.0, style["rise"]], dtype=torch.float64)
+        home = focus + reach * torch.tensor([0.0, -1.0, style.rise], dtype=torch.float64)
         return home + offset, focus + 0.06 * reach * jitter
     if family == "re10k":
-        start, end, yaw = style["start"], style["end"], style["yaw"]
         along = 0.5 + (u - 0.5) * min(spread, 1.5)
         # A gently bent walk (quadratic Bezier), looking ahead with slowly turning yaw.
-        way = (1 - along)[:, None] ** 2 * start + (2 * along * (1 - along))[:, None] * style["bend"]
-        way = way + along[:, None] ** 2 * end + 0.02 * jitter
-        heading = yaw + style["turn"] * (along - 0.5) + 0.08 * spread * jitter[:, 0]
+        way = (1 - along)[:, None] ** 2 * style.start + (2 * along * (1 - along))[:, None] * style.bend
+        way = way + along[:, None] ** 2 * style.end + 0.02 * jitter
+        heading = style.yaw + style.turn * (along - 0.5) + 0.08 * spread * jitter[:, 0]
         ahead = torch.stack([heading.cos(), heading.sin(), -0.08 + 0.05 * jitter[:, 2]], -1)
         return focus + way, focus + way + ahead
     if family == "dtu":
-        azimuth = style["azimuth"] + draw(count, -1, 1) * math.radians(50) * spread
+        azimuth = style.azimuth + draw(count, -1, 1) * math.radians(50) * spread
         middle = math.radians(38)
         elevation = middle + (draw(count, math.radians(15), math.radians(62)) - middle) * min(spread, 1.0)
         return _around(focus, azimuth, elevation, reach * (1 + 0.06 * jitter[:, 0])), focus + 0.03 * reach * jitter
-    turn = style["azimuth"] + 2 * math.pi * (u - 0.5) * min(spread, 1.0)
+    turn = style.azimuth + 2 * math.pi * (u - 0.5) * min(spread, 1.0)
     low, high = (0.2, 0.75) if family == "co3d" else (0.15, 0.7)
-    sway = style["tilt"] + 0.18 * torch.sin(turn * style["sway"]) + 0.08 * jitter[:, 1]
+    swing = style.tilt + 0.18 * torch.sin(turn * style.sway) + 0.08 * jitter[:, 1]
     distance = reach * (1 + 0.12 * jitter[:, 0])
-    return _around(focus, turn, sway.clamp(low, high), distance), focus + 0.05 * reach * jitter
-
-
-def _style(family: str, reach: float, draw: _Draw, extent: Tensor) -> dict:
-    """What all cameras of one capture share."""
-    one = [float(x) for x in draw(8, 0, 1)]
-    style = {
-        "azimuth": 2 * math.pi * one[0], "rise": -0.05 + 0.45 * one[1], "tilt": 0.25 + 0.3 * one[2],
-        "sway": 1.0 + float(one[3] > 0.5), "yaw": 2 * math.pi * one[4], "turn": (one[5] - 0.5) * 1.6,
-    }  # fmt: skip
-    if family == "re10k":
-        ahead = torch.tensor([math.cos(style["yaw"]), math.sin(style["yaw"]), 0.0], dtype=torch.float64)
-        aside = torch.tensor([-ahead[1], ahead[0], 0.0], dtype=torch.float64)
-        lean = 0.5 * (one[6] - 0.5) * extent.min() * aside
-        # Walk mostly forward, from the wall behind towards the middle.
-        style["start"] = -0.75 * ahead * extent[:2].min() + lean
-        style["end"] = (-0.1 + 0.3 * one[7]) * ahead * extent[:2].min() - lean
-        style["bend"] = 0.5 * (style["start"] + style["end"]) + 0.25 * (one[3] - 0.5) * aside * extent[:2].min()
-    return style
+    return _around(focus, turn, swing.clamp(low, high), distance), focus + 0.05 * reach * jitter
 
 
 def random_cameras(scene: Scene | str, seed: int, count: int, width: int, height: int, spread: float = 1.0) -> Cameras:
@@ -128,12 +144,14 @@ def random_cameras(scene: Scene | str, seed: int, count: int, width: int, height
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
 
     kept: list[tuple[float, Tensor]] = []
+    style = _random_style(draw, extent)
     for attempt in range(_MAX_ROUNDS):
         # A blocked capture (a walk that starts inside a cupboard) is drawn anew every few rounds.
-        if attempt % 6 == 0:
-            style, kept = _style(family, reach, draw, extent), []
+        if attempt and attempt % 6 == 0:
+            style, kept = _random_style(draw, extent), []
         u = (torch.arange(2 * count, dtype=torch.float64) + draw(2 * count, 0, 1)) / (2 * count)
-        poses = look_at(*_place(family, focus, reach, style, u, draw, spread), roll=draw(2 * count, -0.03, 0.03))
+        centers, targets = _place(family, focus, reach, style, u, draw, spread)
+        poses = look_at(centers, targets, roll=draw(2 * count, -0.03, 0.03))
         size = torch.tensor([width, height]).expand(len(poses), 2)
         cameras = Cameras(intrinsics.expand(len(poses), 3, 3).clone(), poses, size.clone())
         usable = _usable(scene, cameras) if isinstance(scene, Scene) else torch.ones(len(poses), dtype=torch.bool)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -100,12 +101,17 @@ def photo_texture(photos: Tensor, size: int, generator: torch.Generator) -> Tens
     return F.interpolate(window, (size, size), mode="bilinear", antialias=True, align_corners=False)[0].clamp(0, 1)
 
 
-def texture_pyramid(textures: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """All mip levels in one table, for lookups by index.
+class Pyramid(NamedTuple):
+    """All mip levels of many textures: table (S * T * texels, 3), one texture's texels contiguous, level by level;
+    first (L,): the first texel of each level; side (L,): texels along each level's edge."""
 
-    textures (S, T, 3, N, N) -> table (S * T * texels, 3), the first texel of each level (L,), the side of each level
-    (L,). One texture's texels are contiguous, level by level.
-    """
+    table: Tensor
+    first: Tensor
+    side: Tensor
+
+
+def texture_pyramid(textures: Tensor) -> Pyramid:
+    """Mip levels of textures (S, T, 3, N, N), each the 2x2 means of the one before."""
     scenes, count, _, size, _ = textures.shape
     level = textures.reshape(scenes * count, 3, size, size)
     levels, sides = [], []
@@ -118,15 +124,16 @@ def texture_pyramid(textures: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     table = torch.cat(levels, -1).permute(0, 2, 1).reshape(-1, 3).contiguous()
     side = torch.tensor(sides, device=textures.device)
     first = torch.cumsum(side * side, 0) - side * side
-    return table, first, side
+    return Pyramid(table, first, side)
 
 
-def sample_pyramid(table: Tensor, first: Tensor, side: Tensor, which: Tensor, uv: Tensor, footprint: Tensor) -> Tensor:
+def sample_pyramid(pyramid: Pyramid, which: Tensor, uv: Tensor, footprint: Tensor) -> Tensor:
     """Trilinear lookup with mirrored repetition.
 
     which (...): row of the texture (scene * T + slot); uv (..., 2) in repeats; footprint (...): width of a sample in
     repeats -> colours (..., 3).
     """
+    table, first, side = pyramid
     texels = int((side * side).sum())
     level = torch.log2((footprint * side[0]).clamp(min=1)).clamp(max=len(side) - 1.001)
     low = level.floor().long()

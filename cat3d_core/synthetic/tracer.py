@@ -11,7 +11,7 @@ from torch import Tensor
 from cat3d_core.cameras import Cameras
 from cat3d_core.synthetic import intersect
 from cat3d_core.synthetic.scene import KINDS, Scene, slot_range
-from cat3d_core.synthetic.textures import sample_pyramid, texture_pyramid
+from cat3d_core.synthetic.textures import Pyramid, sample_pyramid, texture_pyramid
 
 # Rays x objects traced at once: small enough for a CPU's cache, large enough to hide a GPU's launch times.
 _CHUNK = {"cpu": 1 << 18, "cuda": 1 << 26}
@@ -127,7 +127,7 @@ def _visibility(scene: Scene, used: dict[str, slice], hits: Hits, to_light: Tens
 
 
 def _surface_colour(
-    scene: Scene, used: dict[str, slice], pyramid: tuple, hits: Hits, directions: Tensor, radius: Tensor
+    scene: Scene, used: dict[str, slice], pyramid: Pyramid, hits: Hits, directions: Tensor, radius: Tensor
 ) -> Tensor:
     """(S, R, 3) light leaving the surfaces towards the camera. radius (S, R): ray footprint at t = 1."""
     batch = torch.arange(len(scene), device=hits.t.device)[:, None]
@@ -139,7 +139,7 @@ def _surface_colour(
     t = torch.where(hits.t.isfinite(), hits.t, torch.zeros_like(hits.t))
     footprint = 2 * radius * t * repeats / facing.sqrt()
     which = batch * scene.textures.shape[1] + scene.texture[batch, hits.slot]
-    texel = sample_pyramid(*pyramid, which, torch.stack([u, v], -1) * repeats[..., None], footprint)
+    texel = sample_pyramid(pyramid, which, torch.stack([u, v], -1) * repeats[..., None], footprint)
     albedo = (scene.bias[batch, hits.slot] + scene.tint[batch, hits.slot] * texel).clamp(0, 1)
 
     light = scene.light[:, None]
@@ -156,7 +156,7 @@ def _surface_colour(
     return diffuse + scene.gloss[batch, hits.slot][..., None] * highlight * seen * (lambert > 0)
 
 
-def _sky_colour(scene: Scene, pyramid: tuple, directions: Tensor, radius: Tensor) -> Tensor:
+def _sky_colour(scene: Scene, pyramid: Pyramid, directions: Tensor, radius: Tensor) -> Tensor:
     """(S, R, 3) background along each direction."""
     unit = _unit(directions)
     elevation = unit[..., 2]
@@ -169,7 +169,7 @@ def _sky_colour(scene: Scene, pyramid: tuple, directions: Tensor, radius: Tensor
     batch = torch.arange(len(scene), device=unit.device)[:, None]
     which = (batch * scene.textures.shape[1] + slot.long()).expand_as(u)
     footprint = radius / intersect.length(directions) * repeats / math.pi * 2
-    panorama = sample_pyramid(*pyramid, which, torch.stack([u, v], -1), footprint)
+    panorama = sample_pyramid(pyramid, which, torch.stack([u, v], -1), footprint)
     return gradient + (panorama - gradient) * weight[..., None]
 
 

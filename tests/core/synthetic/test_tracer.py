@@ -128,10 +128,10 @@ def test_textures_are_colours_and_the_pyramid_keeps_their_mean():
     textures = torch.stack([procedural_texture(32, random) for _ in range(3 * len(PATTERNS))])[None]
     assert ((textures >= 0) & (textures <= 1)).all()
     assert float(textures.var((3, 4)).mean()) > 1e-3
-    table, first, side = texture_pyramid(textures)
+    pyramid = texture_pyramid(textures)
     which = torch.arange(textures.shape[1])
     uv = torch.rand(len(which), 2, generator=random)
-    blurred = sample_pyramid(table, first, side, which, uv, torch.full((len(which),), 1e9))
+    blurred = sample_pyramid(pyramid, which, uv, torch.full((len(which),), 1e9))
     torch.testing.assert_close(blurred, textures[0].mean((2, 3)), atol=5e-3, rtol=0)
 
 
@@ -141,7 +141,7 @@ def test_texture_lookup_hits_texel_centres():
     v, u = torch.meshgrid((torch.arange(8) + 0.5) / 8, (torch.arange(8) + 0.5) / 8, indexing="ij")
     # The first of the mirrored repeats runs from 1 to 2.
     uv = torch.stack([u, v], -1) + 1
-    got = sample_pyramid(*pyramid, torch.zeros(8, 8, dtype=torch.long), uv, torch.zeros(8, 8))
+    got = sample_pyramid(pyramid, torch.zeros(8, 8, dtype=torch.long), uv, torch.zeros(8, 8))
     torch.testing.assert_close(got.permute(2, 0, 1), texture[0, 0], atol=1e-5, rtol=0)
 
 
