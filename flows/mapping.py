@@ -104,15 +104,17 @@ class Mapper:
         if any(m is not None for m in masks):
             reader.mask_path = str(self.masks)
         mode = pycolmap.CameraMode.SINGLE if self.shared else pycolmap.CameraMode.PER_IMAGE
-        for first in range(0, len(photos), EXTRACTION_BATCH):
-            batch = [image_name(i) for i in range(first, min(first + EXTRACTION_BATCH, len(photos)))]
-            if self.shared and first > 0:
-                reader.existing_camera_id = 1
+        names = [image_name(i) for i in range(len(photos))]
+        # Imported first, in order: extraction alone numbers images as its threads finish, and mapping depends on that.
+        pycolmap.Database.open(str(self.database)).close()
+        pycolmap.import_images(self.database, self.images, mode, names, reader)
+        self._set_focal_priors(focals)
+        for first in range(0, len(names), EXTRACTION_BATCH):
+            batch = names[first : first + EXTRACTION_BATCH]
             pycolmap.extract_features(
                 self.database, self.images, batch, mode, reader, options, device=pycolmap.Device.cpu
             )
             self.progress("features", first + len(batch), len(photos))
-        self._set_focal_priors(focals)
         self.seconds["features"] = time.perf_counter() - start
 
     def _set_focal_priors(self, focals: list[float | None]) -> None:
@@ -127,6 +129,7 @@ class Mapper:
     def match(self) -> None:
         """Match pairs and verify them by two-view geometry."""
         start = time.perf_counter()
+        pycolmap.set_random_seed(self.seed)  # the approximate nearest-neighbour index draws from it
         pairs = image_pairs(len(self.sizes))
         for first in range(0, len(pairs), MATCHING_BATCH):
             batch = pairs[first : first + MATCHING_BATCH]
