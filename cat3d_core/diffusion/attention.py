@@ -1,7 +1,7 @@
 """Attention, and the one place where the views of a group become one sequence of tokens.
 
-Everywhere else the G groups of V views are a plain batch of G*V images. Weights are those of a 2D network: joining views
-adds no parameters (paper, section 3.1; MVDream), so a pretrained text-to-image U-Net loads as it is.
+Everywhere else the G groups of V views are a plain batch of G*V images. Weights are those of a 2D network: joining
+views adds no parameters (paper, section 3.1; MVDream), so a pretrained text-to-image U-Net loads as it is.
 """
 
 from __future__ import annotations
@@ -104,7 +104,9 @@ class TransformerBlock(nn.Module):
 
     def forward(self, tokens: Tensor, views: int, context: Tensor | None) -> Tensor:
         """tokens [G*V, L, C], context [G*V, 1, C'] -> [G*V, L, C]."""
-        tokens = tokens + self._attend(self.attn1, self.norm1(tokens), views, "none" if self.mode == "temporal" else self.mode)
+        tokens = tokens + self._attend(
+            self.attn1, self.norm1(tokens), views, "none" if self.mode == "temporal" else self.mode
+        )
         if self.mode == "temporal":
             tokens = tokens + self._attend(self.attn_views, self.norm_views(tokens), views, "temporal")
         if context is not None:
@@ -117,7 +119,8 @@ class TransformerBlock(nn.Module):
 
 
 class SpatialTransformer(nn.Module):
-    """A transformer block on feature maps, with a residual around it. `linear_projection`: SD2 (else 1x1 convolutions, SD1)."""
+    """A transformer block on feature maps, with a residual around it. `linear_projection`: SD2 (else 1x1 convolutions,
+    SD1)."""
 
     def __init__(
         self,

@@ -98,8 +98,8 @@ def autoencoder_loss(
 ) -> tuple[Tensor, dict[str, float]]:
     """L1 on pixels and on their differences to the neighbours (edges), and a small KL term (Rombach et al. 2022).
 
-    images [B, 3, H, W] in [0, 1]; noise [B, C, H/8, W/8] standard normal. Returns the loss and numbers to log (psnr in dB
-    of the clamped reconstruction). A perceptual term may be added by the caller.
+    images [B, 3, H, W] in [0, 1]; noise [B, C, H/8, W/8] standard normal. Returns the loss and numbers to log (psnr in
+    dB of the clamped reconstruction). A perceptual term may be added by the caller.
     """
     mean, log_variance = autoencoder.posterior(images)
     decoded = autoencoder.decode_raw(mean + (0.5 * log_variance).exp() * noise.to(mean.dtype)).float()

@@ -39,9 +39,7 @@ class LatentBank:
     def __len__(self) -> int:
         return self.latents.shape[0]
 
-    def batch(
-        self, groups: int, views: int, seed: int, *key: str | int, spread: float = 1.0
-    ) -> tuple[Tensor, Tensor]:
+    def batch(self, groups: int, views: int, seed: int, *key: str | int, spread: float = 1.0) -> tuple[Tensor, Tensor]:
         """Draw latents [groups, views, C, h, w] and raymaps [groups, views, 6, h, w] relative to view 0, on the CPU.
 
         Every family is equally likely (paper, appendix A), then every scene of it. A group is a random view and others
@@ -61,7 +59,9 @@ class LatentBank:
         center = torch.randint(total, (groups,), generator=random)
         here = poses[torch.arange(groups), center]
         # Nearness in position and viewing direction: both in units of the scene's size and of a radian.
-        apart = (poses[:, :, :3, 3] - here[:, None, :3, 3]).norm(dim=-1) + (poses[:, :, :3, 2] - here[:, None, :3, 2]).norm(dim=-1)
+        apart = (poses[:, :, :3, 3] - here[:, None, :3, 3]).norm(dim=-1) + (
+            poses[:, :, :3, 2] - here[:, None, :3, 2]
+        ).norm(dim=-1)
         near = apart.argsort(1)[:, :pool]
         picked = near.gather(1, torch.rand(groups, pool, generator=random).argsort(1)[:, :views])
         rows = scene[:, None].expand_as(picked)

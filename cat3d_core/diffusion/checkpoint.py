@@ -41,7 +41,9 @@ def save_model(
         for name, t in model.state_dict().items()
     }
     if not all(torch.isfinite(t).all() for t in state.values()):
-        raise ValueError(f"The weights to be saved in {path} have values that are not finite (in {dtype or 'their dtype'}).")
+        raise ValueError(
+            f"The weights to be saved in {path} have values that are not finite (in {dtype or 'their dtype'})."
+        )
     digest = weights_hash(state)
     metadata = {
         "format": FORMAT,
@@ -64,12 +66,16 @@ def load_model(
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path} is no cat3d model: its format is {metadata.get('format')!r}, expected {FORMAT!r}.")
     if check and weights_hash(state) != metadata["sha256"]:
-        raise ValueError(f"{path} is damaged: its weights don't have the hash recorded in it. Fetch or export it again.")
+        raise ValueError(
+            f"{path} is damaged: its weights don't have the hash recorded in it. Fetch or export it again."
+        )
     with torch.device("meta"):
         model = MultiViewModel(ModelConfig.from_json(metadata["config"]))
     missing = sorted(set(model.state_dict()) ^ set(state))
     if missing:
-        raise ValueError(f"{path} doesn't fit its configuration; weights missing or left over: {', '.join(missing[:5])}.")
+        raise ValueError(
+            f"{path} doesn't fit its configuration; weights missing or left over: {', '.join(missing[:5])}."
+        )
     model.load_state_dict({name: t.to(dtype) if t.is_floating_point() else t for name, t in state.items()}, assign=True)
     return model.to(device).eval().requires_grad_(False)
 
@@ -115,6 +121,6 @@ def _read(path: Path, weights: bool = True) -> tuple[dict[str, str], dict[str, T
         raise FileNotFoundError(f"There is no model file {path}.")
     try:
         with safe_open(path, "pt") as file:
-            return file.metadata() or {}, {k: file.get_tensor(k) for k in file.keys()} if weights else {}
+            return file.metadata() or {}, {k: file.get_tensor(k) for k in file.keys()} if weights else {}  # noqa: SIM118
     except SafetensorError as error:
         raise ValueError(f"{path} is not a readable safetensors file ({error}).") from error

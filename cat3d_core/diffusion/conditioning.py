@@ -48,8 +48,9 @@ def relative_raymaps(raymaps_world: Tensor, world_from_reference: Tensor) -> Ten
 
 
 def ray_features(raymaps: Tensor, octaves: int) -> Tensor:
-    """[..., 6, h, w] -> [..., 6 (1 + 2 octaves), h, w]: the rays and sin, cos of 2^k pi / 2 times them, k < octaves (Fourier
-    features as in SRT's raymaps, Sajjadi et al. 2022, and 3DiM's). A dropped (zero) map keeps a pattern of its own."""
+    """[..., 6, h, w] -> [..., 6 (1 + 2 octaves), h, w]: the rays and sin, cos of 2^k pi / 2 times them, k < octaves
+    (Fourier features as in SRT's raymaps, Sajjadi et al. 2022, and 3DiM's). A dropped (zero) map keeps a pattern of
+    its own."""
     parts = [raymaps]
     for octave in range(octaves):
         angle = raymaps * (2**octave * math.pi / 2)
@@ -60,8 +61,8 @@ def ray_features(raymaps: Tensor, octaves: int) -> Tensor:
 def camera_vectors(raymaps: Tensor) -> Tensor:
     """The 8 numbers of the paper's pose-vector ablation (appendix C), read off the raymaps.
 
-    raymaps [..., 6, h, w] (origin, direction; h, w >= 2) -> [..., 8]: position (3), unit quaternion w, x, y, z (4) and the
-    focal length over the image width (1). A map of zeros (dropped pose) gives zeros.
+    raymaps [..., 6, h, w] (origin, direction; h, w >= 2) -> [..., 8]: position (3), unit quaternion w, x, y, z (4) and
+    the focal length over the image width (1). A map of zeros (dropped pose) gives zeros.
 
     A pinhole camera's directions are p = R K^-1 (u, v, 1) up to length, and p is affine in (u, v): the corners obey
     p00 - p10 - p01 + p11 = 0, three equations for the unknown lengths.
@@ -86,12 +87,14 @@ def camera_vectors(raymaps: Tensor) -> Tensor:
 
 
 def _quaternion(rotation: Tensor) -> Tensor:
-    """[..., 3, 3] -> [..., 4] (w, x, y, z), w >= 0: the largest eigenvector of the quaternion's outer product, taken from
-    its best conditioned column (Shepperd's method without branches)."""
+    """[..., 3, 3] -> [..., 4] (w, x, y, z), w >= 0: the largest eigenvector of the quaternion's outer product, taken
+    from its best conditioned column (Shepperd's method without branches)."""
     r = rotation
     trace = r.diagonal(dim1=-2, dim2=-1).sum(-1)
     rows = [
-        torch.stack([1 + trace, r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], -1)
+        torch.stack(
+            [1 + trace, r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], -1
+        )
     ]
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3

@@ -56,7 +56,9 @@ class UNetConfig:
     def __post_init__(self) -> None:
         levels = len(self.channels)
         if len(self.attention) != levels or len(self.heads) != levels:
-            raise ValueError(f"The U-Net has {levels} levels of channels, so attention and heads need {levels} entries.")
+            raise ValueError(
+                f"The U-Net has {levels} levels of channels, so attention and heads need {levels} entries."
+            )
         for channels, heads in zip(self.channels, self.heads, strict=True):
             if channels % self.norm_groups or channels % heads:
                 raise ValueError(

@@ -29,7 +29,10 @@ def load_autoencoder(path: str | Path) -> KLAutoencoder | TinyAutoencoder:
     weights = load_file(files[0])
     kind = config.get("_class_name")
     if kind == "AutoencoderTiny":
-        parts = [{k[len(p) :]: v for k, v in weights.items() if k.startswith(p)} for p in ("encoder.layers.", "decoder.layers.")]
+        parts = [
+            {k[len(p) :]: v for k, v in weights.items() if k.startswith(p)}
+            for p in ("encoder.layers.", "decoder.layers.")
+        ]
         return TinyAutoencoder(*parts)
     if kind == "AutoencoderKL":
         model = KLAutoencoder(config)
@@ -55,7 +58,9 @@ class KLAutoencoder(nn.Module):
         self.encoder = _KLHalf(3, 2 * latent, widths, layers, groups, encoder=True)
         self.decoder = _KLHalf(latent, 3, widths[::-1], layers + 1, groups, encoder=False)
         self.quant_conv = nn.Conv2d(2 * latent, 2 * latent, 1) if config.get("use_quant_conv", True) else nn.Identity()
-        self.post_quant_conv = nn.Conv2d(latent, latent, 1) if config.get("use_post_quant_conv", True) else nn.Identity()
+        self.post_quant_conv = (
+            nn.Conv2d(latent, latent, 1) if config.get("use_post_quant_conv", True) else nn.Identity()
+        )
 
     def encode(self, images: Tensor) -> Tensor:
         mean = self.quant_conv(self.encoder(images * 2 - 1)).chunk(2, 1)[0]
@@ -188,8 +193,8 @@ class _TinyBlock(nn.Module):
 
 
 def _tiny_layers(weights: dict[str, Tensor], is_decoder: bool) -> nn.Sequential:
-    """Indices without weights are the decoder's ReLU (after its first convolution) and then its upsamplings; convolutions
-    without bias are the encoder's strided ones."""
+    """Indices without weights are the decoder's ReLU (after its first convolution) and then its upsamplings;
+    convolutions without bias are the encoder's strided ones."""
     layers: list[nn.Module] = []
     indices = sorted({int(name.split(".")[0]) for name in weights})
     for index in range(indices[0], indices[-1] + 1):

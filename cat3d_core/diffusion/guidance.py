@@ -28,7 +28,11 @@ class GuidanceConfig:
 
 
 def guided(
-    predict: Callable[[Condition, Tensor], Tensor], condition: Condition, x: Tensor, log_snr: float, config: GuidanceConfig
+    predict: Callable[[Condition, Tensor], Tensor],
+    condition: Condition,
+    x: Tensor,
+    log_snr: float,
+    config: GuidanceConfig,
 ) -> Tensor:
     """predict(condition, x [G, N, C, h, w]) -> float32 prediction of that shape; both halves run as one batch of 2G."""
     if not config.active(log_snr):

@@ -10,7 +10,8 @@ from torch import Tensor, nn
 
 
 def time_embedding(time: Tensor, channels: int) -> Tensor:
-    """Sinusoids of a (fractional) step: time [B] -> [B, channels] float32, cosines first (Vaswani et al.; SD's order)."""
+    """Sinusoids of a (fractional) step: time [B] -> [B, channels] float32, cosines first (Vaswani et al.; SD's
+    order)."""
     half = channels // 2
     frequency = torch.exp(-math.log(10000.0) * torch.arange(half, device=time.device, dtype=torch.float32) / half)
     angle = time.float()[:, None] * frequency

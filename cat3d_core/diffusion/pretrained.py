@@ -22,8 +22,8 @@ _TEXT = re.compile(r"(.*\.transformer_blocks\.\d+)\.(attn2|norm2)\.")
 
 @dataclass
 class Report:
-    """Where every weight went. taken: as it is; widened: got new input channels, zero; folded: text attention that became
-    a bias; left: in the file, of no use here; fresh: in the network only, at their initial values."""
+    """Where every weight went. taken: as it is; widened: got new input channels, zero; folded: text attention that
+    became a bias; left: in the file, of no use here; fresh: in the network only, at their initial values."""
 
     taken: list[str] = field(default_factory=list)
     widened: list[str] = field(default_factory=list)
@@ -42,8 +42,8 @@ def load_stable_diffusion(
 
     text_token [D]: the constant token whose cross-attention is folded into biases (default zeros); changes: fields of
     UNetConfig that differ from the file's network (e.g. max_3d_size=64, decoder_only=True). Heads come from config.json
-    where there is one; else from the shapes: convolutional projections mean SD 1.x (8 heads at every level), linear ones
-    SD 2.x (64 channels a head). Raises ValueError for files that are no such U-Net, naming the first odd weight.
+    where there is one; else from the shapes: convolutional projections mean SD 1.x (8 heads at every level), linear
+    ones SD 2.x (64 channels a head). Raises ValueError for files that are no such U-Net, naming the first odd weight.
     """
     weights, heads = _read(Path(path))
     config = dataclasses.replace(_infer_config(weights, heads, path), **changes)
@@ -92,8 +92,8 @@ def inflate(unet: MultiViewUNet, weights: dict[str, Tensor], text_token: Tensor 
 
 
 def export_2d(unet: MultiViewUNet, latent_channels: int | None = None) -> dict[str, Tensor]:
-    """The 2D network inside: diffusers keys, raymap and mask channels cut off, text attention that adds nothing left out.
-    `inflate` of the result gives the same network as long as rays and mask had no effect yet."""
+    """The 2D network inside: diffusers keys, raymap and mask channels cut off, text attention that adds nothing left
+    out. `inflate` of the result gives the same network as long as rays and mask had no effect yet."""
     keep = latent_channels or unet.config.latent_channels
     state = {k: v.detach().clone() for k, v in unet.state_dict().items() if "_views." not in k}
     state["conv_in.weight"] = state["conv_in.weight"][:, :keep]

@@ -39,8 +39,9 @@ def sample(
 ) -> Tensor:
     """Latents of target views given conditioning views, for G independent groups.
 
-    condition_latents [G, M, C, h, w]; raymaps [G, M+N, 6, h, w], conditioning views first, relative to the first of them;
-    noise [G, N, C, h, w] standard normal, keyed by view. Returns [G, N, C, h, w] float32.
+    condition_latents [G, M, C, h, w]; raymaps [G, M+N, 6, h, w], conditioning views first, relative to the first of
+    them; noise [G, N, C, h, w] standard normal, keyed by view. Returns [G, N, C, h, w] float32 (float64 for float64 noise;
+    the network runs in the dtype of its weights).
     Groups with fewer targets than the model was trained with (views - M) are padded with repeated targets, keeping the
     trained noise shift; the padding is dropped. Raises ValueError for shapes that don't fit together.
     """
@@ -50,15 +51,18 @@ def sample(
     if noise.shape[0] != groups or raymaps.shape[:2] != (groups, given + targets):
         raise ValueError(
             f"{groups} groups of {given} conditioning and {targets} target views need raymaps [{groups}, "
-            f"{given + targets}, 6, h, w] and noise [{groups}, {targets}, C, h, w]; got raymaps {tuple(raymaps.shape)} and "
+            f"{given + targets}, 6, h, w] and noise [{groups}, {targets}, C, h, w]; got raymaps "
+            f"{tuple(raymaps.shape)} and "
             f"noise {tuple(noise.shape)}."
         )
     if given < 1 or targets < 1 or given + targets > views:
         raise ValueError(
-            f"A group of this model has at least one conditioning and one target view and at most {views} views in all; "
+            f"A group of this model has at least one conditioning and one target view and at most {views} views in "
+            f"all; "
             f"got {given} + {targets}. Split the targets into more groups."
         )
-    inputs = [condition_latents.float(), *_pad_targets(raymaps.float(), noise.float(), views - given)]
+    dtype = torch.promote_types(noise.dtype, torch.float32)  # of the state
+    inputs = [condition_latents.to(dtype), *_pad_targets(raymaps.to(dtype), noise.to(dtype), views - given)]
     batch = config.micro_batch or groups
     results = []
     for start in range(0, groups, batch):
@@ -95,9 +99,9 @@ def _sample_batch(
 
     def clean(x: Tensor, i: int) -> Tensor:
         def predict(given: Condition, x: Tensor) -> Tensor:
-            time = torch.full((x.shape[0],), times[i], device=x.device)
+            time = torch.full((x.shape[0],), times[i], device=x.device, dtype=x.dtype)
             full = torch.cat([given.latents, x], 1)
-            return model.unet(full, time, given.raymaps, given.mask)[:, given.latents.shape[1] :].float()
+            return model.unet(full, time, given.raymaps, given.mask)[:, given.latents.shape[1] :].to(x.dtype)
 
         prediction = guided(predict, condition, x, float(nodes[i]), config.guidance)
         return schedule.clean(x, prediction, nodes[i])

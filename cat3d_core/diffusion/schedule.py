@@ -1,4 +1,5 @@
-"""Noise levels: x = alpha * clean + sigma * noise with alpha^2 + sigma^2 = 1, described by log-SNR = log(alpha^2 / sigma^2).
+"""Noise levels: x = alpha * clean + sigma * noise with alpha^2 + sigma^2 = 1, described by log-SNR = log(alpha^2 /
+sigma^2).
 
 Tables are float64 on the CPU. With N target views the log-SNR is lowered by log N (paper, section 3.1, after 'simple
 diffusion', Hoogeboom et al. 2023): N consistent images tell N times as much about a scene as one.
@@ -16,8 +17,8 @@ from cat3d_core.diffusion.config import ScheduleConfig
 
 Nodes = Literal["trailing", "linspace", "log_snr", "karras"]
 
-# With zero terminal SNR the first node is pure noise (log-SNR -inf); nodes spaced in log-SNR start again from here. Below
-# it the clean latent's estimate hardly differs from that of pure noise (sigma/alpha = 55).
+# With zero terminal SNR the first node is pure noise (log-SNR -inf); nodes spaced in log-SNR start again from here.
+# Below it the clean latent's estimate hardly differs from that of pure noise (sigma/alpha = 55).
 LOWEST_LOG_SNR = -8.0
 
 
@@ -48,8 +49,9 @@ class Schedule:
     def nodes(self, kind: Nodes, steps: int) -> Tensor:
         """log-SNRs [steps] at which the network is evaluated, noisiest first, float64.
 
-        trailing: steps T-1, T-1-T/n, ... (Lin et al. 2023); linspace: from step T-1 to 0; log_snr: uniform in log-SNR over
-        the table's range; karras: uniform in (sigma/alpha)^(1/7) (Karras et al. 2022). The last three end at step 0.
+        trailing: steps T-1, T-1-T/n, ... (Lin et al. 2023); linspace: from step T-1 to 0; log_snr: uniform in log-SNR
+        over the table's range; karras: uniform in (sigma/alpha)^(1/7) (Karras et al. 2022). The last three end at step
+        0.
         """
         if steps < 3:
             raise ValueError(f"Sampling needs at least 3 steps, not {steps}.")
@@ -66,7 +68,7 @@ class Schedule:
         return _spaced(kind, noisiest, cleanest, steps)
 
     def clean(self, x: Tensor, prediction: Tensor, log_snr: Tensor) -> Tensor:
-        """The clean latent that a v- or eps-prediction at this (scalar) noise level stands for. float32 and up."""
+        """The clean latent that a v- or eps-prediction at this (scalar) noise level stands for, in x's dtype."""
         alpha, sigma = (float(s) for s in alpha_sigma(log_snr.double()))
         if self.config.prediction == "v":
             return alpha * x - sigma * prediction

@@ -1,10 +1,10 @@
 """Solvers of the probability-flow ODE, as multistep exponential integrators on predictions of the clean latent.
 
-In the half log-SNR l = log(alpha / sigma) the ODE is d(x / sigma)/dl = exp(l) clean(x, l), so from l_s to l_t, h = l_t - l_s,
-    x_t = sigma_t/sigma_s x_s + alpha_t (1 - exp(-h)) clean + corrections from how `clean` changed over the last steps.
-DDIM is the first order (Song et al. 2021); DPM-Solver++(2M) the second order multistep (Lu et al. 2022); UniPC adds a
-corrector that costs no evaluation (Zhao et al. 2023, B(h) = exp(h) - 1). Steps from pure noise (h = inf) and to the clean
-latent (h = inf) are first order. Coefficients are float64 scalars, the state keeps its own dtype.
+In the half log-SNR l = log(alpha / sigma) the ODE is d(x / sigma)/dl = exp(l) clean(x, l), so from l_s to l_t, h = l_t
+- l_s, x_t = sigma_t/sigma_s x_s + alpha_t (1 - exp(-h)) clean + corrections from how `clean` changed over the last
+steps. DDIM is the first order (Song et al. 2021); DPM-Solver++(2M) the second order multistep (Lu et al. 2022); UniPC
+adds a corrector that costs no evaluation (Zhao et al. 2023, B(h) = exp(h) - 1). Steps from pure noise (h = inf) and to
+the clean latent (h = inf) are first order. Coefficients are float64 scalars, the state keeps its own dtype.
 """
 
 from __future__ import annotations
@@ -63,7 +63,8 @@ class Solver:
 
     def _correct(self, i: int, clean: Tensor) -> Tensor:
         """UniC: redo step i (from node i to i + 1) now that the prediction at its end is known."""
-        assert self.previous is not None and self.start is not None
+        assert self.previous is not None
+        assert self.start is not None
         h = self._h(i)
         result = self._first_order(i, self.start, self.previous)
         scale = -self.alpha[i + 1] * math.expm1(-h)
@@ -83,8 +84,8 @@ class Solver:
 
 
 def integrate(x: Tensor, log_snr: Tensor, clean: Callable[[Tensor, int], Tensor], solver: SolverName) -> Tensor:
-    """From noise at log_snr[0] to the last node. `clean(x, i)` predicts the clean latent at node i; it is called once for
-    every node but the last."""
+    """From noise at log_snr[0] to the last node. `clean(x, i)` predicts the clean latent at node i; it is called once
+    for every node but the last."""
     state = Solver(solver, log_snr)
     for i in range(len(log_snr) - 1):
         x = state.step(i, x, clean(x, i))

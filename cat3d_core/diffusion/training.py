@@ -1,4 +1,5 @@
-"""Training the multi-view denoiser: the loss, one step, EMA, exact resumption; alone or data-parallel under torchrun."""
+"""Training the multi-view denoiser: the loss, one step, EMA, exact resumption; alone or data-parallel under
+torchrun."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ from cat3d_core.random import generator
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Paper (appendix A): lr 5e-5 fine-tuning at batch 128, drop probability 0.1. For training from scratch see 'small'.
+    """Paper (appendix A): lr 5e-5 fine-tuning at batch 128, drop probability 0.1. For training from scratch see
+    'small'.
 
     total_steps counts optimizer steps; the learning rate rises linearly for `warmup_steps`, then follows a half cosine
     down to `final_learning_rate` at total_steps. accumulate: calls of `step` per optimizer step. min_snr_gamma: weight
@@ -70,9 +72,7 @@ def diffusion_loss(
     noise = torch.randn(clean.shape, generator=random).to(clean.device)
     alpha, sigma = (s.float().to(clean.device)[:, None, None, None, None] for s in alpha_sigma(log_snr))
     noisy = alpha * clean + sigma * noise
-    condition = drop_condition(
-        make_condition(latents[:, :n_condition], raymaps), dropped.to(clean.device), config.drop
-    )
+    condition = drop_condition(make_condition(latents[:, :n_condition], raymaps), dropped.to(clean.device), config.drop)
     time = schedule.time(log_snr).float().to(clean.device)
     output = unet(torch.cat([condition.latents, noisy], 1), time, condition.raymaps, condition.mask)
     target = alpha * noise - sigma * clean if schedule.config.prediction == "v" else noise
@@ -95,7 +95,9 @@ class Trainer:
     `model` itself is not changed; `ema_model()` gives the model to sample from or to save.
     """
 
-    def __init__(self, config: TrainConfig, model: MultiViewModel, seed: int, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self, config: TrainConfig, model: MultiViewModel, seed: int, device: torch.device | str = "cpu"
+    ) -> None:
         self.config = config
         self.seed = seed
         self.device = torch.device(device)
@@ -178,7 +180,9 @@ class Trainer:
     def _model(self, weights: list[Tensor]) -> MultiViewModel:
         with torch.device("meta"):
             model = MultiViewModel(self.model_config)
-        model.unet.load_state_dict({n: w.detach().cpu().clone() for n, w in zip(self.names, weights, strict=True)}, assign=True)
+        model.unet.load_state_dict(
+            {n: w.detach().cpu().clone() for n, w in zip(self.names, weights, strict=True)}, assign=True
+        )
         model.autoencoder = copy.deepcopy(self.autoencoder)
         return model.cpu().eval().requires_grad_(False)
 
@@ -197,7 +201,9 @@ class Trainer:
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Continue from `state()`. Raises ValueError if it belongs to another network."""
         if {k[7:] for k in state if k.startswith("master.")} != set(self.names):
-            raise ValueError("This training state belongs to a network with other weights; use the configuration it was saved with.")
+            raise ValueError(
+                "This training state belongs to a network with other weights; use the configuration it was saved with."
+            )
         self.calls, self.seed = int(state["calls"]), int(state["seed"])
         for i, name in enumerate(self.names):
             master = self.masters[i]

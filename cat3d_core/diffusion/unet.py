@@ -65,7 +65,9 @@ class MultiViewUNet(nn.Module):
         """
         groups, views, channels, height, width = latents.shape
         if channels != self.config.latent_channels:
-            raise ValueError(f"The latents have {channels} channels, this U-Net works on {self.config.latent_channels}.")
+            raise ValueError(
+                f"The latents have {channels} channels, this U-Net works on {self.config.latent_channels}."
+            )
         dtype = self.conv_in.weight.dtype
         mask_map = mask.to(latents.dtype)[:, :, None, None, None].expand(-1, -1, 1, height, width)
         parts = [latents, mask_map]

@@ -21,9 +21,12 @@ def test_shapes_and_normalisation():
     autoencoder.calibrate(images)
     latents = autoencoder.encode(images)
     assert latents.shape == (16, 8, 4, 4)
-    assert latents.mean((0, 2, 3)).abs().max() < 1e-4 and latents.std((0, 2, 3)).max() < 1.01
+    assert latents.mean((0, 2, 3)).abs().max() < 1e-4
+    assert latents.std((0, 2, 3)).max() < 1.01
     decoded = autoencoder.decode(latents)
-    assert decoded.shape == images.shape and 0 <= decoded.min() and decoded.max() <= 1
+    assert decoded.shape == images.shape
+    assert decoded.min() >= 0
+    assert decoded.max() <= 1
     raw = autoencoder.posterior(images)[0]
     torch.testing.assert_close(autoencoder.decode_raw(raw).clamp(0, 1), decoded, rtol=0, atol=1e-5)
     with pytest.raises(ValueError, match="multiples of 8"):

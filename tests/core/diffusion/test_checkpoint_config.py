@@ -15,7 +15,9 @@ from tests.core.diffusion.models import random_model, tiny
 def test_configuration_survives_json(name):
     config = SIZES[name]
     assert ModelConfig.from_json(config.to_json()) == config
-    changed = dataclasses.replace(config, views=4, unet=dataclasses.replace(config.unet, camera="vector", decoder_only=True))
+    changed = dataclasses.replace(
+        config, views=4, unet=dataclasses.replace(config.unet, camera="vector", decoder_only=True)
+    )
     assert ModelConfig.from_json(changed.to_json()) == changed != config
 
 
@@ -39,11 +41,13 @@ def test_checkpoint_round_trip(tmp_path, dtype):
     model = random_model()
     digest = save_model(tmp_path / "m.safetensors", model, {"data": "none", "steps": 3}, dtype)
     loaded = load_model(tmp_path / "m.safetensors")
-    assert loaded.config == model.config and not list(tmp_path.glob("*.partial"))
+    assert loaded.config == model.config
+    assert not list(tmp_path.glob("*.partial"))
     for name, value in model.state_dict().items():
         torch.testing.assert_close(loaded.state_dict()[name], value.to(dtype or value.dtype).float(), rtol=0, atol=0)
     about = describe(tmp_path / "m.safetensors")
-    assert about["provenance"] == {"data": "none", "steps": 3} and about["sha256"] == digest
+    assert about["provenance"] == {"data": "none", "steps": 3}
+    assert about["sha256"] == digest
     if dtype is None:
         assert weights_hash(loaded.state_dict()) == digest
 

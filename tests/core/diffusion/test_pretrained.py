@@ -1,4 +1,5 @@
-"""Stable Diffusion layouts and foreign autoencoders, with diffusers as the oracle (random weights, made on the spot)."""
+"""Stable Diffusion layouts and foreign autoencoders, with diffusers as the oracle (random weights, made on the
+spot)."""
 
 from __future__ import annotations
 
@@ -52,9 +53,12 @@ def test_folder_gives_the_2d_output_with_text_folded(layout, tmp_path):
     unet, report = load_stable_diffusion(tmp_path, token, latent_size=8, max_3d_size=8)
     _compare(oracle, unet, token)
     names = set(oracle.state_dict())
-    assert set(report.taken) | set(report.widened) | set(report.folded) == names and not report.left
-    assert report.widened == ["conv_in.weight"] and not report.fresh
-    assert report.folded and all(".attn2." in n or ".norm2." in n for n in report.folded)
+    assert set(report.taken) | set(report.widened) | set(report.folded) == names
+    assert not report.left
+    assert report.widened == ["conv_in.weight"]
+    assert not report.fresh
+    assert report.folded
+    assert all(".attn2." in n or ".norm2." in n for n in report.folded)
     # Round trip: the 2D network inside, put back, is the same network.
     again = MultiViewUNet(unet.config)
     assert not inflate(again, export_2d(unet)).fresh
@@ -112,24 +116,29 @@ def test_single_file_in_the_original_layout(tmp_path):
     save_file({**weights, "first_stage_model.x": torch.zeros(1)}, tmp_path / "sd.safetensors")
     unet, report = load_stable_diffusion(tmp_path / "sd.safetensors", torch.zeros(24), latent_size=8)
     _compare(oracle, unet, torch.zeros(24))
-    assert not report.left and not report.fresh
+    assert not report.left
+    assert not report.fresh
 
 
 def test_linear_projections_mean_64_channels_a_head(tmp_path):
     save_file({k: v.contiguous() for k, v in _oracle(SD2).state_dict().items()}, tmp_path / "sd.safetensors")
     unet, _ = load_stable_diffusion(tmp_path / "sd.safetensors")
-    assert unet.config.heads == (1, 2, 2) and unet.config.linear_projection
+    assert unet.config.heads == (1, 2, 2)
+    assert unet.config.linear_projection
 
 
 def test_changed_networks_are_accounted_for(tmp_path):
     _oracle(SD2).save_pretrained(tmp_path)
     _, report = load_stable_diffusion(tmp_path, latent_channels=8)
-    assert report.widened == ["conv_in.weight"] and sorted(report.left) == ["conv_out.bias", "conv_out.weight"]
+    assert report.widened == ["conv_in.weight"]
+    assert sorted(report.left) == ["conv_out.bias", "conv_out.weight"]
     assert sorted(report.fresh) == ["conv_out.bias", "conv_out.weight"]
     _, report = load_stable_diffusion(tmp_path, view_attention="temporal", latent_size=8)
-    assert report.fresh and all("_views" in n for n in report.fresh)
+    assert report.fresh
+    assert all("_views" in n for n in report.fresh)
     _, report = load_stable_diffusion(tmp_path, camera="vector")
-    assert not report.folded and sorted(report.fresh) == ["camera_embedding.bias", "camera_embedding.weight"]
+    assert not report.folded
+    assert sorted(report.fresh) == ["camera_embedding.bias", "camera_embedding.weight"]
 
 
 def test_other_files_are_refused(tmp_path):

@@ -22,7 +22,10 @@ def _groups(groups: int, given: int = 3, targets: int = 5) -> tuple[torch.Tensor
     latents = torch.randn(groups, given, 8, 8, 8, generator=g)
     raymaps = torch.randn(groups, given + targets, 6, 8, 8, generator=g)
     noise = torch.stack(
-        [torch.stack([normal((8, 8, 8), 0, "scene", i * targets + j, "noise") for j in range(targets)]) for i in range(groups)]
+        [
+            torch.stack([normal((8, 8, 8), 0, "scene", i * targets + j, "noise") for j in range(targets)])
+            for i in range(groups)
+        ]
     )
     return latents, raymaps, noise
 
@@ -79,11 +82,14 @@ def test_guidance_formula_and_what_is_dropped():
     out = guided(predict, condition, x, 0.0, GuidanceConfig(3.0, drop="images"))
     torch.testing.assert_close(out, torch.full_like(out, 0 + 3 * 2 + 1.0))
     assert seen[0].latents.shape[0] == 4
-    assert seen[0].latents[2:].abs().sum() == 0 and seen[0].mask[2:].sum() == 0 and seen[0].raymaps[2:].min() == 1
+    assert seen[0].latents[2:].abs().sum() == 0
+    assert seen[0].mask[2:].sum() == 0
+    assert seen[0].raymaps[2:].min() == 1
     guided(predict, condition, x, 9.0, GuidanceConfig(3.0, high_log_snr=5.0))
     assert seen[1].latents.shape[0] == 2
     everything = drop_condition(condition, torch.tensor([True, False]), "images_and_poses")
-    assert everything.raymaps[0].abs().sum() == 0 and torch.equal(everything.raymaps[1], condition.raymaps[1])
+    assert everything.raymaps[0].abs().sum() == 0
+    assert torch.equal(everything.raymaps[1], condition.raymaps[1])
 
 
 def test_short_groups_are_padded_to_the_trained_size():

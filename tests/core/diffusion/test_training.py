@@ -50,10 +50,13 @@ def test_loss_is_on_targets_only_with_clean_conditioning():
     assert torch.equal(seen["x"][:, :3], latents[:, :3].float())
     assert seen["mask"].tolist() == [[1] * 3 + [0] * 5] * 4
     # A zero prediction of v leaves E[v^2] = alpha^2 + sigma^2 E[clean^2] = 1 for unit latents.
-    assert loss.shape == (4,) and abs(float(loss.mean()) - 1) < 0.1
+    assert loss.shape == (4,)
+    assert abs(float(loss.mean()) - 1) < 0.1
     config = dataclasses.replace(CONFIG, drop_probability=1.0)
     diffusion_loss(Spy(), schedule, latents, raymaps, 3, torch.Generator().manual_seed(0), config)
-    assert seen["x"][:, :3].abs().sum() == 0 and seen["mask"].sum() == 0 and seen["rays"].abs().sum() == 0
+    assert seen["x"][:, :3].abs().sum() == 0
+    assert seen["mask"].sum() == 0
+    assert seen["rays"].abs().sum() == 0
 
 
 def test_min_snr_weights():
@@ -88,7 +91,9 @@ def test_resumed_run_is_bit_identical(precision, tmp_path):
 def test_state_of_another_network_is_refused():
     state = Trainer(CONFIG, MultiViewModel(tiny()), 0).state()
     with pytest.raises(ValueError, match="another|other weights"):
-        Trainer(CONFIG, MultiViewModel(tiny(channels=(32, 64, 64), heads=(1, 2, 2), attention=(True,) * 3)), 0).load_state(state)
+        Trainer(
+            CONFIG, MultiViewModel(tiny(channels=(32, 64, 64), heads=(1, 2, 2), attention=(True,) * 3)), 0
+        ).load_state(state)
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
@@ -170,7 +175,8 @@ def test_bank_draws_groups_of_one_scene_with_matching_rays():
     torch.testing.assert_close(raymaps[7], expected, rtol=0, atol=1e-6)
     again, _ = bank.batch(40, 5, 0, "step", 1)
     other, _ = bank.batch(40, 5, 0, "step", 2)
-    assert torch.equal(again, latents) and not torch.equal(other, latents)
+    assert torch.equal(again, latents)
+    assert not torch.equal(other, latents)
 
 
 def test_bank_spread_limits_the_distance():

@@ -36,7 +36,8 @@ def test_folding_is_undone_and_keeps_groups_apart(groups, views, length, mode):
 
 @pytest.mark.parametrize("changes", VARIANTS)
 def test_one_view_is_the_2d_network(changes):
-    """V = 1: joining views changes nothing (1e-5, float32). Temporal attention has weights of its own: zero at first."""
+    """V = 1: joining views changes nothing (1e-5, float32). Temporal attention has weights of its own: zero at
+    first."""
     joint = random_model(**changes).unet
     if joint.config.view_attention == "temporal":
         for name, parameter in joint.named_parameters():
