@@ -27,11 +27,11 @@ def run(
     views: Annotated[
         str, typer.Option(help="Training views: counts with a split of the data set, or all; several by commas.")
     ] = "all",
-    downscale: Annotated[int, typer.Option(help="Divide image width and height by this.")] = 1,
+    downscale: Annotated[float, typer.Option(help="Divide image width and height by this.")] = 1,
     method: Annotated[
         str, typer.Option(help="zipnerf: captured views only; cat3d: with generated views.")
     ] = "zipnerf",
-    preset: Annotated[str, typer.Option(help="Reconstruction preset: fast, balanced, paper.")] = "fast",
+    preset: Annotated[str, typer.Option(help="reconstruction preset: tiny, fast, balanced, paper.")] = "fast",
     seed: Annotated[int, typer.Option(help="All randomness follows from it.")] = 0,
     reader: Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")] = "auto",
     images: Annotated[str | None, typer.Option(help="Image folder inside the scene, where there are several.")] = None,
@@ -68,6 +68,54 @@ def inspect(
     from flows.inspect_command import inspect_command
 
     inspect_command(store, verify, as_json)
+
+
+@app.command()
+def sweep(
+    config: Annotated[str, typer.Argument(help="A sweep's YAML file, or the name of a shipped one (see --list).")] = "",
+    out: OutOption = Path("outputs/sweep"),
+    list_: Annotated[bool, typer.Option("--list", help="List the shipped sweeps.")] = False,
+) -> None:
+    """Benchmark sweep: scenes x training views x methods x seeds. Run again, it fills in what is missing."""
+    from flows.sweep_command import sweep_command
+
+    raise typer.Exit(sweep_command(config, out, list_))
+
+
+@app.command()
+def reprocess(
+    out: Annotated[Path, typer.Argument(help="The --out folder of an earlier run or sweep.")],
+    split: Annotated[str | None, typer.Option(help="Only runs with these training views, e.g. 3.")] = None,
+    from_: Annotated[str | None, typer.Option("--from", help="Redo this stage and all after it.")] = None,
+    where: Annotated[
+        list[str] | None, typer.Option(help="Only runs that match, e.g. scene=llff_* or method=cat3d. May be repeated.")
+    ] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="A setting to change in every run, e.g. reconstruct.preset=paper.")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what is stale, why, and what it costs.")] = False,
+) -> None:
+    """Redo what is stale after a change of images, cameras, splits, settings, code or model; nothing else."""
+    from flows.reprocess import reprocess_command
+    from flows.run_command import settings_document
+
+    problems = reprocess_command(out, split, from_, where or [], settings_document(set_ or []), dry_run)
+    for sentence in problems:
+        print(f"cat3d: {sentence}", file=sys.stderr)
+    raise typer.Exit(1 if problems else 0)
+
+
+@app.command()
+def results(
+    out: Annotated[Path, typer.Argument(help="The --out folder of a run or sweep.")],
+    against: Annotated[Path | None, typer.Option(help="Another folder: print changes, exit 1 on a regression.")] = None,
+    bound: Annotated[float, typer.Option(help="PSNR loss in dB that counts as a regression.")] = 0.1,
+    bound_rest: Annotated[float, typer.Option(help="Loss of SSIM or LPIPS that counts as a regression.")] = 0.01,
+) -> None:
+    """Print an output folder's numbers and compare them with another's."""
+    from flows.results import results_command
+
+    raise typer.Exit(1 if results_command(out, against, bound, bound_rest) else 0)
 
 
 def main() -> None:

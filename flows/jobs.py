@@ -38,16 +38,23 @@ class Job(BaseModel):
     scene_id: str
     dataset: str
     config: RunConfig
+    store: Path | None = None
 
     @property
     def store_path(self) -> Path:
-        return self.out / f"{self.scene_id}.zarr"
+        """Where the scene's store is; `store` overrides it while a scene is reprocessed beside its old results."""
+        return self.store or self.out / f"{self.scene_id}.zarr"
+
+    @property
+    def label(self) -> str:
+        """The method's name, or that of the ablation."""
+        return self.config.label or self.config.method
 
     @property
     def run(self) -> str:
         """Name of the run inside the store, e.g. "v3-zipnerf"; seeds other than 0 are named too."""
         seed = f"-s{self.config.seed}" if self.config.seed else ""
-        return f"v{self.config.split}-{self.config.method}{seed}"
+        return f"v{self.config.split}-{self.label}{seed}"
 
     @property
     def pictures(self) -> Path:

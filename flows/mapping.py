@@ -77,7 +77,7 @@ class Mapper:
         self.database.unlink(missing_ok=True)
         self.pair_list = folder / "pairs.txt"
         self.sizes: list[tuple[int, int]] = []
-        self.scales: list[float] = []
+        self.scales: list[tuple[float, float]] = []  # working size / photo size, per axis
         self.shared = False
         self.focal_source = ""
         self.seconds: dict[str, float] = {}
@@ -95,7 +95,7 @@ class Mapper:
             if masks and masks[i] is not None:
                 write_png(self.masks / f"{image_name(i)}.png", resize(read_mask(masks[i]), *small))  # type: ignore[arg-type]
             self.sizes.append((width, height))
-            self.scales.append(small[0] / width)
+            self.scales.append((small[0] / width, small[1] / height))
         self.shared = len(set(self.sizes)) == 1 and len(set(focals)) == 1
         self.focal_source = FROM_EXIF if all(focals) else "the photos themselves (self-calibration)"
         options = pycolmap.FeatureExtractionOptions()
@@ -122,7 +122,7 @@ class Mapper:
             for image in database.read_all_images():
                 focal, camera = focals[image_index(image.name)], database.read_camera(image.camera_id)
                 if focal:
-                    camera.focal_length = focal * self.scales[image_index(image.name)]
+                    camera.focal_length = focal * self.scales[image_index(image.name)][0]
                     camera.has_prior_focal_length = True
                     database.update_camera(camera)
 

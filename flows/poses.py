@@ -116,7 +116,7 @@ def _best_result(attempts: list[Attempt], job: Mapper, names: list[str]) -> Pose
     intrinsics, distortion = [], []
     for i in placed:
         k, d = intrinsics_of(best.cameras[by_index[i].camera_id], f"the estimate for {names[i]}")
-        k[:2] /= job.scales[i]
+        k[:2] /= torch.tensor(job.scales[i], dtype=torch.float64)[:, None]
         intrinsics.append(k)
         distortion.append(d)
     poses = from_camera_from_world(torch.stack([camera_from_world(by_index[i]) for i in placed]))

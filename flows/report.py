@@ -199,7 +199,8 @@ def _embedded_file(path: Path) -> str:
 
 def markdown_table(rows: list[dict[str, Any]]) -> str:
     """The summary as a Markdown table."""
-    columns = "scene|training views|method|seed|protocol|resolution|test views|PSNR (dB)|SSIM|LPIPS|seconds".split("|")
+    columns = ["scene", "training views", "method", "seed", "protocol", "resolution", "test views"]
+    columns += ["PSNR (dB)", "SSIM", "LPIPS", "seconds"]
     lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
     for r in rows:
         lpips = f"{number(r['lpips'], 3)} ({r['backbone']})" if r["lpips"] is not None else "-"

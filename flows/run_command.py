@@ -12,7 +12,7 @@ import yaml
 from flows.jobs import Job, capture_digests, expected_steps, make_jobs, pending
 from flows.progress import console
 from flows.readers.base import InputError
-from schemas.config import RunConfig, load_config, parse_config
+from schemas.config import RunConfig, load_config, merged, parse_config
 from schemas.errors import ConfigError
 
 #: Where each command-line option lives in the configuration.
@@ -83,6 +83,12 @@ def make_config(given: dict[str, Any], config_file: Path | None, settings: Seque
         path = OPTION_FIELDS[name]
         if config_file is None or value != _get(defaults, path):
             _set(document, path, value)
+    return parse_config(merged(document, settings_document(settings)), "the settings")
+
+
+def settings_document(settings: Sequence[str]) -> dict[str, Any]:
+    """--set NAME=VALUE options as nested settings. Raises ConfigError for one that can't be read."""
+    document: dict[str, Any] = {}
     for text in settings:
         name, equals, value = text.partition("=")
         if not equals:
@@ -92,7 +98,7 @@ def make_config(given: dict[str, Any], config_file: Path | None, settings: Seque
         except yaml.YAMLError:
             raise ConfigError(f"--set {text}: the value is not valid YAML.") from None
         _set(document, tuple(name.split(".")), parsed)
-    return parse_config(document, "the settings")
+    return document
 
 
 def _get(document: dict[str, Any], path: tuple[str, ...]) -> Any:

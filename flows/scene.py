@@ -51,13 +51,17 @@ def run_stage(stage: str, job: dict[str, Any], step: dict[str, Any]) -> dict[str
 @flow(name="cat3d-scene", flow_run_name="{scene_id}", validate_parameters=False)
 def scene_flow(scene_id: str, jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """All stages of all jobs of one scene that are not done yet, in order. Returns the records of what ran."""
+    return run_jobs([Job.model_validate(job) for job in jobs])
+
+
+def run_jobs(jobs: list[Job]) -> list[dict[str, Any]]:
+    """What `scene_flow` does, inside whichever flow calls it: the jobs of one scene, each missing stage a task."""
     records = []
-    parsed = [Job.model_validate(job) for job in jobs]
-    capture = parsed[0].capture()
+    capture = jobs[0].capture()
     digests = capture_digests(capture)
-    with writing(parsed[0].store_path, scene_id):
-        ensure_store(parsed[0], capture)
-        for job in parsed:
+    with writing(jobs[0].store_path, jobs[0].scene_id):
+        ensure_store(jobs[0], capture)
+        for job in jobs:
             prepare_run(job, capture)
             for step in pending(job, expected_steps(job, capture, digests)):
                 console.print(f"[bold]{step.stage}[/bold] {job.scene_id} {job.run} ({step.why})")
@@ -96,7 +100,7 @@ def write_timing(job: Job, record: StageRecord) -> None:
     """One row per execution in `timings/`; the file's name holds the time, so that earlier executions stay."""
     known = {name: int(value) for name, value in record.work.items() if name in TIMINGS.names}
     row = {
-        "scene_id": job.scene_id, "dataset": job.dataset, "run": job.run, "method": job.config.method,
+        "scene_id": job.scene_id, "dataset": job.dataset, "run": job.run, "method": job.label,
         "split": job.config.split, "seed": job.config.seed, "key": record.key, "code_version": record.code_version,
         "stage": record.stage, "started_at": datetime.fromisoformat(record.started_at), "seconds": record.seconds,
         "skipped": False, "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
@@ -131,12 +135,12 @@ def prepare_run(job: Job, capture: Capture) -> None:
         roles[split[role]] = ROLES[role]
     if "role" not in run or not np.array_equal(run.read("role"), roles):
         run.write("role", roles)
-    run.set_attrs(job=job.model_dump(mode="json"))
+    run.set_attrs(job=job.model_copy(update={"store": None}).model_dump(mode="json"))
 
 
 @contextlib.contextmanager
 def writing(store_path: Path, scene_id: str) -> Iterator[None]:
-    """Be the only command that writes this store; a kill frees the lock. Raises InputError while another one is at it."""
+    """Be the only command that writes this store; a kill frees the lock. Raises InputError while another one writes."""
     store_path.parent.mkdir(parents=True, exist_ok=True)
     lock = store_path.with_name(f".{scene_id}.lock")
     with open(lock, "a+") as file:

@@ -24,23 +24,19 @@ class _Model(BaseModel):
 class IngestConfig(_Model):
     """Reading the photos."""
 
-    downscale: PositiveInt = 1
+    downscale: Annotated[FiniteFloat, Field(ge=1)] = 1
     """Divide width and height by this."""
     max_pixels: PositiveInt = 100_000_000
     """Refuse larger source images, in pixels."""
-    undistort: bool = True
-    """Undo lens distortion, where the source gives it."""
 
 
 class PosesConfig(_Model):
     """Estimating cameras, where the source has none."""
 
-    max_features: PositiveInt = 8192
+    max_features: PositiveInt = 4000
     """Image features extracted per photo at most."""
-    camera_model: Literal["OPENCV", "SIMPLE_RADIAL", "SIMPLE_PINHOLE", "PINHOLE"] = "OPENCV"
-    """COLMAP's camera model."""
-    shared_intrinsics: bool = True
-    """All photos come from one camera with one focal length."""
+    camera_model: Literal["SIMPLE_RADIAL", "OPENCV", "SIMPLE_PINHOLE", "PINHOLE"] = "SIMPLE_RADIAL"
+    """COLMAP's camera model. Photos of equal size share one camera."""
     min_registered: Annotated[float, Field(gt=0, le=1)] = 0.5
     """Fail if a smaller share of the photos could be placed."""
     normalize: bool = True
@@ -86,7 +82,7 @@ class SampleConfig(_Model):
 class ReconstructConfig(_Model):
     """Fitting the field (paper, section 3.3)."""
 
-    preset: Literal["fast", "balanced", "paper"] = "fast"
+    preset: Literal["tiny", "fast", "balanced", "paper"] = "fast"
     """Point on the measured front of quality against time."""
     overrides: dict[str, Any] = Field(default_factory=dict)
     """Settings of the trainer that replace the preset's."""
@@ -97,8 +93,8 @@ class RenderConfig(_Model):
 
     test_views: bool = True
     """Render the held-out captured views."""
-    path: Literal["none", "spiral", "plan"] = "spiral"
-    """Camera path of the video."""
+    path: Literal["none", "auto"] = "auto"
+    """Camera path of the video; auto: the curve of the recipe that suits the training views."""
     path_views: PositiveInt = 60
     """Frames of the video."""
     fps: PositiveFloat = 30.0
@@ -130,6 +126,45 @@ class RunConfig(_Model):
     reconstruct: ReconstructConfig = Field(default_factory=ReconstructConfig)
     render: RenderConfig = Field(default_factory=RenderConfig)
     evaluate: EvaluateConfig = Field(default_factory=EvaluateConfig)
+
+
+class SceneSource(_Model):
+    """One scene of a sweep."""
+
+    source: str
+    """Folder of the scene or a procedural spec; $VARIABLES are replaced from the environment."""
+    reader: str = "auto"
+    image_folder: str | None = None
+    settings: dict[str, Any] = Field(default_factory=dict)
+    """Settings of RunConfig for this scene alone, such as {ingest: {downscale: 8}}."""
+
+
+class SweepConfig(_Model):
+    """A benchmark sweep: scenes x splits x methods x seeds."""
+
+    name: str
+    note: str = ""
+    """What the numbers stand for, printed in the report."""
+    scenes: tuple[SceneSource, ...]
+    splits: tuple[str, ...] = ("3", "6", "9")
+    """Training views: counts, `all`, or names of splits. A scene without one of them leaves it out."""
+    methods: dict[str, dict[str, Any]] = Field(default_factory=lambda: {"zipnerf": {"method": "zipnerf"}})
+    """Label -> settings of RunConfig that make the method or the ablation."""
+    seeds: tuple[Annotated[int, Field(ge=0)], ...] = (0,)
+    base: dict[str, Any] = Field(default_factory=dict)
+    """Settings of RunConfig for all runs."""
+    workers: PositiveInt = 1
+    """Scenes worked on at the same time."""
+
+
+def merged(*documents: dict[str, Any]) -> dict[str, Any]:
+    """Nested settings, later documents over earlier ones."""
+    out: dict[str, Any] = {}
+    for document in documents:
+        for name, value in document.items():
+            both = isinstance(value, dict) and isinstance(out.get(name), dict)
+            out[name] = merged(out[name], value) if both else value
+    return out
 
 
 def load_config(path: str | Path, model: type[BaseModel] = RunConfig) -> Any:

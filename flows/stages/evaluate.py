@@ -63,7 +63,7 @@ def view_rows(job, key, protocol, view, name, image, truth, mask, perceptual) ->
     height, width = image.shape[:2]
     return [
         {
-            "scene_id": job.scene_id, "dataset": job.dataset, "run": job.run, "method": job.config.method,
+            "scene_id": job.scene_id, "dataset": job.dataset, "run": job.run, "method": job.label,
             "split": job.config.split, "seed": job.config.seed, "key": key, "code_version": str(VERSION),
             "protocol": protocol, "view": view, "view_name": name, "width": width, "height": height,
             "psnr_db": measured["psnr"], "ssim": measured["ssim"], "lpips": lpips,

@@ -14,6 +14,7 @@ from flows import images
 from flows.jobs import Job, Outcome, capture_digests
 from flows.progress import meter
 from flows.readers.base import Capture, InputError
+from schemas.config import IngestConfig
 from schemas.scene_store import SceneStore
 
 VERSION = 1
@@ -34,7 +35,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     with meter(f"ingest {job.scene_id}", count) as progress, ThreadPoolExecutor(2) as pool:
 
         def one(view: int) -> Ingested:
-            out = ingest_view(capture, view, job.config.ingest.downscale, job.config.ingest.max_pixels)
+            out = ingest_view(capture, view, job.config.ingest)
             progress.advance(note=capture.names[view])
             return out
 
@@ -71,9 +72,12 @@ def write_captured(store: SceneStore, capture: Capture, views: list[Ingested]) -
 
 
 def ingest_view(
-    capture: Capture, view: int, downscale: float, max_pixels: int, distortion: Tensor | None = None,
+    capture: Capture,
+    view: int,
+    settings: IngestConfig,
+    distortion: Tensor | None = None,
     camera: Cameras | None = None,
-) -> Ingested:  # fmt: skip
+) -> Ingested:
     """Read one view, undistort it at full size, then shrink it.
 
     camera and distortion override the capture's own (for poses that were estimated).
@@ -82,7 +86,7 @@ def ingest_view(
     if capture.images is not None:
         image, alpha = capture.images[view], None
     else:
-        image, alpha = images.read_image(capture.paths[view], max_pixels=max_pixels)
+        image, alpha = images.read_image(capture.paths[view], max_pixels=settings.max_pixels)
     mask = alpha
     if capture.masks and capture.masks[view] is not None:
         mask = images.read_mask(capture.masks[view])
@@ -104,7 +108,7 @@ def ingest_view(
         if mask is not None:
             mask, _ = images.undistort(mask, original, distortion, nearest=True)
         camera = Cameras(intrinsics[None], camera.world_from_camera, camera.size)
-    small_width, small_height = max(1, round(width / downscale)), max(1, round(height / downscale))
+    small_width, small_height = (max(1, round(side / settings.downscale)) for side in (width, height))
     image = images.resize(image, small_width, small_height)
     if mask is not None:
         mask = images.resize(mask, small_width, small_height)

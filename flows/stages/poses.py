@@ -74,7 +74,7 @@ def _estimate(
             image = photos[view] if capture.images is not None else images.image_size(photos[view])
             width, height = (image.shape[1], image.shape[0]) if isinstance(image, np.ndarray) else image
             camera = camera.resize(width, height)
-        views.append(ingest_view(capture, view, job.config.ingest.downscale, job.config.ingest.max_pixels, lens, camera))
+        views.append(ingest_view(capture, view, job.config.ingest, lens, camera))
     write_captured(store, capture, views)
     size = torch.from_numpy(store.captured.read("size").astype(np.int64))
     poses = torch.stack([result.cameras.world_from_camera[row.get(v, 0)] for v in range(len(capture))])
