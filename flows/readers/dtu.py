@@ -89,7 +89,7 @@ def decompose_projection(projection: Tensor) -> tuple[Tensor, Tensor]:
     pose[:, :3, :3] = rotation
     pose[:, :3, 3:] = torch.linalg.solve(k, projection[:, :, 3:])
     k = k / k[:, 2:, 2:]
-    k[:, 0, 1] = 0  # skew: rounding only
+    k[:, 0, 1] = k[:, 2, 1] = k[:, 1, 0] = k[:, 2, 0] = 0  # rounding only
     return k, from_camera_from_world(pose)
 
 
