@@ -22,9 +22,8 @@ except ImportError:  # CPU builds of torch come without it
     triton = None
 
 _BLOCK = 128
-_FIXED_POINT_BITS = (
-    34  # the largest gradient becomes 2^34: 2^28 such terms fit an int64, steps are finer than float32's
-)
+# The largest gradient becomes 2^34: 2^28 such terms fit an int64, and the steps are finer than float32's.
+_FIXED_POINT_BITS = 34
 
 
 def available() -> bool:

@@ -54,6 +54,22 @@ class Trainer:
         self.adam = Adam(parameters, decay, config.adam_beta1, config.adam_beta2, config.adam_eps)
         self.iteration = 0
         self.skipped = 0
+        self.best_error, self.stale_checks = math.inf, 0
+        self._held_out: Batch | None = None
+        if config.plateau_patience:
+            generator = torch.Generator(self.device).manual_seed(derive_seed(seed, "nerf", "held out"))
+            self._held_out = draw_batch(self.views, config.plateau_pixels, 1, 1.0, generator)
+            self.views = self.views.without(self._held_out)
+
+    @property
+    def converged(self) -> bool:
+        """With `plateau_patience`: the error of the held-out pixels has stopped falling."""
+        return 0 < self.config.plateau_patience <= self.stale_checks
+
+    @property
+    def finished(self) -> bool:
+        """All iterations done, or converged."""
+        return self.converged or self.iteration >= self.config.iterations
 
     def learning_rate(self, iteration: int) -> float:
         """Logarithmic decay times Zip-NeRF's sine warm-up."""
@@ -92,6 +108,8 @@ class Trainer:
         else:
             self._skip(views, batches, totals)
         self.iteration += 1
+        if self._held_out is not None and self.iteration % c.plateau_every == 0:
+            self._check_plateau(self._held_out)
         result = {name: float(value) for name, value in totals.items()}
         mse = result.pop("mse")
         psnr = -10.0 * math.log10(mse) if 0.0 < mse < math.inf else math.nan
@@ -158,6 +176,13 @@ class Trainer:
             )
         return terms
 
+    @torch.no_grad()
+    def _check_plateau(self, held_out: Batch) -> None:
+        rays = pixel_rays(self.views.cameras, held_out.view, held_out.xy + 0.5)
+        error = float((render_rays(self.field, rays).rgb - held_out.rgb).abs().mean())
+        self.stale_checks = 0 if error < self.best_error else self.stale_checks + 1
+        self.best_error = min(error, self.best_error)
+
     def _finite(self, totals: dict[str, Tensor]) -> bool:
         gradients = [p.grad.abs().max() for p in self.adam.parameters.values() if p.grad is not None]
         return bool(torch.isfinite(torch.stack([*totals.values(), *gradients])).all())
@@ -189,6 +214,10 @@ class Trainer:
         state = {f"field.{name}": value for name, value in self.field.state_dict().items()}
         state |= {f"adam.{name}": value for name, value in self.adam.state().items()}
         state |= {"trainer.iteration": torch.tensor(self.iteration), "trainer.skipped": torch.tensor(self.skipped)}
+        state |= {
+            "trainer.best_error": torch.tensor(self.best_error, dtype=torch.float64),
+            "trainer.stale_checks": torch.tensor(self.stale_checks),
+        }
         return {name: value.detach().cpu().clone() for name, value in state.items()}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
@@ -204,3 +233,4 @@ class Trainer:
         self.field.load_state_dict({n.removeprefix("field."): v for n, v in state.items() if n.startswith("field.")})
         self.adam.load_state({n.removeprefix("adam."): v for n, v in state.items() if n.startswith("adam.")})
         self.iteration, self.skipped = int(state["trainer.iteration"]), int(state["trainer.skipped"])
+        self.best_error, self.stale_checks = float(state["trainer.best_error"]), int(state["trainer.stale_checks"])

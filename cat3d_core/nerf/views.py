@@ -88,9 +88,19 @@ class Views:
                 masks.append(functional.avg_pool2d(valid[None].float(), 2)[0] == 1)
         return Views(Cameras.cat(cameras), images, self.captured, masks or None)
 
+    def without(self, batch: Batch) -> Views:
+        """These views with the pixels of a batch masked out."""
+        views = self.to(self.pixels.device)
+        views.valid = torch.ones_like(self.pixels[:, 0], dtype=torch.bool) if self.valid is None else self.valid.clone()
+        views.valid[self._index(batch.view, batch.xy)] = False
+        return views
+
+    def _index(self, view: Tensor, xy: Tensor) -> Tensor:
+        return self.offset[view] + xy[:, 1] * self.size[view, 0] + xy[:, 0]
+
     def colours(self, view: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
         """rgb (R, 3) in [0, 1] and validity (R,) float of integer pixels xy (R, 2) of views (R,)."""
-        index = self.offset[view] + xy[:, 1] * self.size[view, 0] + xy[:, 0]
+        index = self._index(view, xy)
         rgb = self.pixels[index].float() / 255.0
         return rgb, torch.ones_like(rgb[:, 0]) if self.valid is None else self.valid[index].float()
 

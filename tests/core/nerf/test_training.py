@@ -213,6 +213,19 @@ def test_low_resolution_first() -> None:
     assert [math.isfinite(trainer.step()["loss"]) for _ in range(2)] == [True, True]
 
 
+def test_plateau_of_held_out_pixels_ends_training_and_survives_resume() -> None:
+    config = dataclasses.replace(
+        TINY, iterations=1000, plateau_patience=1, plateau_every=2, lr_init=1e-9, lr_final=1e-9
+    )
+    trainer = Trainer(config, _views(), seed=0)
+    while not trainer.finished:
+        trainer.step()
+    assert trainer.iteration < 200
+    again = Trainer(config, _views(), seed=0)
+    again.load_state(trainer.state())
+    assert again.finished
+
+
 def test_masked_pixels_do_not_count() -> None:
     views = _views(2)
     black = [torch.zeros(20, 24, dtype=torch.bool)] * 2

@@ -1,0 +1,214 @@
+"""Benchmarks of the reconstruction: PSNR against seconds, and the hash grid kernels against each other.
+
+Scenes are procedural (exact cameras and depth); every row says what was run and how long it took here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from cat3d_core.nerf import PRESETS, ReconstructConfig, Trainer, Views, hash_grid_cpu, hash_grid_triton, render_image
+from cat3d_core.nerf.hash_grid import GridLayout, make_layout, query_reference
+from cat3d_core.normalization import normalize_scene
+from cat3d_core.synthetic import random_cameras, random_scene, trace
+
+Query = Callable[[Tensor, Tensor, Tensor, GridLayout], tuple[Tensor, Tensor]]
+
+#: What `curves` varies, one at a time, around a preset.
+VARIATIONS: dict[str, list[dict[str, Any]]] = {
+    "iterations": [{"iterations": n, "warmup_iterations": n // 10} for n in (100, 300, 1000)],
+    "samples": [{"samples": s} for s in ((16, 8), (32, 16), (64, 32))],
+    "grid": [{"grid_log2_table": n} for n in (14, 16, 18)],
+    "batch": [{"batch_rays": n} for n in (512, 1024, 2048)],
+    "multisamples": [{"multisamples": n} for n in (3, 6)],
+}
+
+
+def procedural_views(
+    family: str, train: int, test: int, width: int = 64, height: int = 64, seed: int = 0
+) -> tuple[Views, Views, list[Tensor]]:
+    """Training views, held-out views, and the held-out true z-depths (H, W), in the normalised scene."""
+    scene = random_scene(family, seed)
+    cameras = random_cameras(scene, seed, train + test, width, height)
+    tracing = trace(scene, cameras)
+    similarity = normalize_scene(cameras)
+    normalised = similarity.cameras(cameras)
+    images = [(view * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous() for view in tracing.image.cpu()]
+    depths = list(tracing.depth.float().cpu() * similarity.scale)
+    # Held-out cameras spread over the capture.
+    held = {round((i + 0.5) * (train + test) / test - 0.5) for i in range(test)}
+    kept = [i for i in range(train + test) if i not in held]
+    shown = sorted(held)
+
+    def views(rows: list[int]) -> Views:
+        return Views(normalised[rows], [images[i] for i in rows], torch.ones(len(rows), dtype=torch.bool))
+
+    return views(kept), views(shown), [depths[i] for i in shown]
+
+
+def train_and_measure(
+    config: ReconstructConfig, train: Views, test: Views, depths: list[Tensor], device: str = "cpu", seed: int = 0
+) -> dict[str, float]:
+    """Train once: mean held-out PSNR (dB), absolute relative error of the median depth, seconds, training rays/s."""
+    trainer = Trainer(config, train, seed, device)
+    started = time.perf_counter()
+    while not trainer.finished:
+        trainer.step()
+    if device != "cpu":
+        torch.cuda.synchronize()
+    seconds = time.perf_counter() - started
+    errors, relative = [], []
+    for index in range(len(test)):
+        out = render_image(trainer.field, test.cameras, index, config)
+        height, width = out.depth.shape
+        first = int(test.offset[index])
+        truth = test.pixels[first : first + height * width].view(height, width, 3).float() / 255
+        errors.append(-10 * math.log10(float((out.image.cpu() - truth).square().mean())))
+        seen = torch.isfinite(depths[index]) & (depths[index] > 0)
+        relative.append(float(((out.depth.cpu() - depths[index]).abs() / depths[index])[seen].mean()))
+    return {
+        "psnr_db": sum(errors) / len(errors),
+        "depth_abs_rel": sum(relative) / len(relative),
+        "seconds": seconds,
+        "iterations": float(trainer.iteration),
+        "rays_per_s": trainer.iteration * config.batch_rays / seconds,
+        "skipped": float(trainer.skipped),
+    }
+
+
+def curves(
+    preset: str = "fast",
+    families: Sequence[str] = ("mip360",),
+    vary: Sequence[str] = tuple(VARIATIONS),
+    train: int = 24,
+    test: int = 4,
+    size: int = 64,
+    iterations: int | None = None,
+    device: str = "cpu",
+) -> list[dict[str, Any]]:
+    """PSNR against seconds: the preset, then each setting of `vary` changed alone. One row per run."""
+    base = PRESETS[preset]
+    if iterations is not None:
+        base = dataclasses.replace(base, iterations=iterations, warmup_iterations=iterations // 10)
+    rows = []
+    for family in families:
+        views, held, depths = procedural_views(family, train, test, size, size)
+        for name, change in [("preset", {}), *((key, value) for key in vary for value in VARIATIONS[key])]:
+            config = dataclasses.replace(base, **change)
+            shown = ", ".join(f"{k}={v}" for k, v in change.items())
+            common = {"family": family, "preset": preset, "varied": name, "setting": shown, "device": device}
+            rows.append(common | train_and_measure(config, views, held, depths, device))
+    return rows
+
+
+def few_view(
+    preset: str = "fast", family: str = "mip360", counts: Sequence[int] = (3, 6, 9), test: int = 4, size: int = 64
+) -> list[dict[str, Any]]:
+    """Held-out quality from few captured views of a procedural scene."""
+    views, held, depths = procedural_views(family, max(counts) * 3, test, size, size)
+    rows = []
+    for count in counts:
+        keep = [round(i * (len(views) - 1) / (count - 1)) for i in range(count)]
+        images = [views.pixels[int(views.offset[i]) :][: size * size].view(size, size, 3) for i in keep]
+        some = Views(views.cameras[keep], images, views.captured[keep])
+        rows.append({"family": family, "views": count} | train_and_measure(PRESETS[preset], some, held, depths))
+    return rows
+
+
+def _kernels(device: str) -> dict[str, Query]:
+    found: dict[str, Query] = {"torch reference": query_reference}
+    if device == "cpu" and hash_grid_cpu.available():
+        found["C++ kernel"] = hash_grid_cpu.query
+    if device == "cuda" and hash_grid_triton.available():
+        found["Triton kernel"] = hash_grid_triton.query
+    return found
+
+
+def _copy_bandwidth(device: str) -> float:
+    """Bytes per second of a large copy (read + write), the best of five."""
+    source = torch.zeros(2**26, device=device)
+    target = torch.empty_like(source)
+    seconds = min(_timed(lambda: target.copy_(source), device) for _ in range(5))
+    return 2 * source.numel() * 4 / seconds
+
+
+def _timed(run: Callable[[], Any], device: str) -> float:
+    started = time.perf_counter()
+    run()
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter() - started
+
+
+def kernels(rays: int = 1024, log2_table: int = 16, repeats: int = 5, device: str = "cpu") -> list[dict[str, Any]]:
+    """Grid queries of one step of the paper's sampling (64 + 64 + 32 intervals of 6 samples), forward and backward.
+
+    The kernels take turns, so that a busy machine slows all alike; each time is the best of `repeats`. `ratio` is
+    against the torch reference. `floor_share` is the least time memory needs (positions and std read, features and
+    weights written, 8 corners of each sample and level gathered once; backward scatters them) over the time taken; a
+    share above 1 means that the corners came from the cache.
+    """
+    bandwidth = _copy_bandwidth(device)
+    generator = torch.Generator().manual_seed(0)
+    rows = []
+    for max_resolution, features, intervals in ((512, 1, 64), (2048, 1, 64), (8192, 4, 32)):
+        layout = make_layout(16, max_resolution, log2_table, features)
+        # Samples along rays through the cube, their spread that of a pixel of a 512-pixel image.
+        start = torch.rand((rays, 1, 1, 3), generator=generator)
+        end = torch.rand((rays, 1, 1, 3), generator=generator)
+        along = torch.linspace(0, 1, intervals * 6).view(1, intervals, 6, 1)
+        positions = (start + (end - start) * along).view(-1, 6, 3).to(device)
+        std = (1e-4 + 1e-3 * along[..., 0]).expand(rays, -1, -1).reshape(-1, 6).to(device)
+        table = torch.randn((layout.rows, features), generator=generator).to(device).requires_grad_()
+        gradient = torch.randn((rays * intervals, layout.levels, features), generator=generator).to(device)
+        best: dict[tuple[str, str], float] = {}
+        for _ in range(repeats):
+            for name, query in _kernels(device).items():
+                table.grad = None
+                kept: list[Tensor] = []
+
+                def forward(query: Query = query, kept: list[Tensor] = kept) -> None:
+                    kept.append(query(table, positions, std, layout)[0])  # noqa: B023
+
+                def backward(kept: list[Tensor] = kept) -> None:
+                    kept[0].backward(gradient)  # noqa: B023
+
+                for phase, run in (("forward", forward), ("backward", backward)):
+                    best[name, phase] = min(best.get((name, phase), math.inf), _timed(run, device))
+        count = rays * intervals
+        corners = count * 6 * 8 * layout.levels * features * 4
+        moved = count * (6 * 16 + layout.levels * (features + 1) * 4)
+        for (name, phase), seconds in best.items():
+            floor = (moved + corners * (1 if phase == "forward" else 2)) / bandwidth
+            row = {
+                "grid": f"2^{log2_table} to {max_resolution}, F={features}",
+                "intervals_per_ray": intervals,
+                "phase": phase,
+                "kernel": name,
+                "ms": seconds * 1e3,
+                "rays_per_s": rays / seconds,
+                "ratio": best["torch reference", phase] / seconds,
+                "floor_share": floor / seconds,
+            }
+            rows.append(row)
+        for name in _kernels(device):
+            total, reference = (sum(best[k, p] for p in ("forward", "backward")) for k in (name, "torch reference"))
+            rows.append(
+                {
+                    "grid": f"2^{log2_table} to {max_resolution}, F={features}",
+                    "intervals_per_ray": intervals,
+                    "phase": "both",
+                    "kernel": name,
+                    "ms": total * 1e3,
+                    "rays_per_s": rays / total,
+                    "ratio": reference / total,
+                }
+            )
+    return rows
