@@ -2,8 +2,20 @@
 
 from cat3d_core.nerf.config import PRESETS, ReconstructConfig
 from cat3d_core.nerf.field import Field
+from cat3d_core.nerf.points import PointCloud, point_cloud
 from cat3d_core.nerf.render import Render, render_image
 from cat3d_core.nerf.trainer import NonFiniteError, Trainer
 from cat3d_core.nerf.views import Views
 
-__all__ = ["PRESETS", "Field", "NonFiniteError", "ReconstructConfig", "Render", "Trainer", "Views", "render_image"]
+__all__ = [
+    "PRESETS",
+    "Field",
+    "NonFiniteError",
+    "PointCloud",
+    "ReconstructConfig",
+    "Render",
+    "Trainer",
+    "Views",
+    "point_cloud",
+    "render_image",
+]

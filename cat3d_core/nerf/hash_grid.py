@@ -60,7 +60,7 @@ def level_weights(std: Tensor, resolution: int) -> Tensor:
     return torch.erf(1.0 / (8.0**0.5 * std * resolution).clamp_min(1e-12))
 
 
-def _corner(layout: GridLayout, level: int, cell: Tensor, bits: tuple[int, int, int]) -> tuple[Tensor, Tensor | None]:
+def _corner(layout: GridLayout, level: int, cell: Tensor, bits: tuple[int, ...]) -> tuple[Tensor, Tensor | None]:
     """Table row (...) of a corner of cells (..., 3) int64, and its validity for dense levels."""
     n = layout.resolutions[level]
     start, rows = layout.offsets[level], layout.offsets[level + 1] - layout.offsets[level]

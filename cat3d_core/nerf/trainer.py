@@ -46,7 +46,7 @@ class Trainer:
         self.views = views.to(self.device)
         self._coarse = views.halved().to(self.device) if config.low_resolution_iterations else None
         self.field = Field(config, seed).to(self.device)
-        parameters = dict(self.field.named_parameters())
+        parameters: dict[str, Tensor] = dict(self.field.named_parameters())
         decay = {
             f"grids.{index}.table": [(first, last, config.weight_decay) for first, last in grid.level_rows()]  # type: ignore[operator]
             for index, grid in enumerate(self.field.grids)
