@@ -157,11 +157,8 @@ def expected_steps(job: Job, capture: Capture, digests: dict[str, Any] | None = 
 def stage_config(config: RunConfig, stage: str) -> dict[str, Any]:
     """The settings that can change the stage's result, as plain JSON values."""
     document = config.model_dump(mode="json")
-    if stage == "sample":
-        document["sample"].pop("batch_groups")  # never changes the result
+    document["sample"].pop("checkpoint")  # the hash of its weights is an input of the stages that use them
     own = {} if stage in ("encode", "decode") else document[stage]
-    if stage in ("encode", "decode"):
-        own["checkpoint"] = document["sample"]["checkpoint"]
     if stage in ("plan", "poses", "sample", "reconstruct"):
         own["seed"] = document["seed"]
     return own

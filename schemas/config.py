@@ -10,7 +10,16 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, PositiveInt, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    ValidationError,
+)
 
 from schemas.errors import ConfigError
 
@@ -44,22 +53,32 @@ class PosesConfig(_Model):
 
 
 class PlanConfig(_Model):
-    """The cameras to generate (paper, section 3.2 and appendix)."""
+    """The cameras to generate (paper, section 3.2 and appendix). None: as the paper does for this number of photos."""
 
     trajectory: str = "auto"
-    """`auto`, or the name of a recipe: spiral, orbit, realestate10k, llff, dtu, co3d, mipnerf360."""
+    """`auto`, or the name of a recipe: single_spiral, single_orbit, realestate10k, llff, dtu, co3d, mipnerf360."""
     views: PositiveInt | None = None
     """Number of generated views; None is the recipe's own (paper: 80 to 960)."""
+    scales: tuple[PositiveFloat, ...] | None = None
+    """Scales of the paths instead of the recipe's; one path for each combination with the shifts."""
+    sides: tuple[FiniteFloat, ...] | None = None
+    """Shifts of the paths to the right, in units of the scene's distance."""
+    heights: tuple[FiniteFloat, ...] | None = None
+    """Shifts upwards."""
+    forwards: tuple[FiniteFloat, ...] | None = None
+    """Shifts ahead."""
     group_size: PositiveInt | None = None
-    """Views sampled together; None: 5 with several captures, 7 with one, as in the paper."""
+    """Views sampled together; None: the model's views (8) less condition_views, and 7 for the anchors of one photo."""
     condition_views: PositiveInt | None = None
-    """Conditioning views per group; None: 3 with several captures, 1 with one."""
-    anchors: PositiveInt = 7
-    """Anchor views sampled first when there is a single capture."""
+    """Conditioning views per group; None: 3."""
+    anchors: NonNegativeInt | None = None
+    """Anchor views sampled first; None: 7 with a single photo, else none."""
     always_captured: bool = False
-    """Keep every captured view among the conditioning views of each group."""
+    """Captured views take conditioning slots before anchors do."""
     wide: bool = False
     """Add the wide samples from padded squares for photos that aren't square."""
+    drop_by_coverage: bool = False
+    """Leave out views that add nothing to the coverage of the scene."""
 
 
 class SampleConfig(_Model):
@@ -67,16 +86,45 @@ class SampleConfig(_Model):
 
     checkpoint: Path | None = None
     """Weights of the model; None: the ones shipped."""
-    steps: PositiveInt = 50
-    """Sampler steps (paper: 50, DDIM)."""
-    solver: str = "ddim"
-    """Name of the solver."""
+    solver: Literal["ddim", "dpm++", "unipc"] = "unipc"
+    """Solver of the probability-flow ODE (paper: ddim)."""
+    nodes: Literal["trailing", "linspace", "log_snr", "karras"] = "log_snr"
+    """Spacing of the noise levels (paper: trailing)."""
+    steps: Annotated[int, Field(ge=3)] = 20
+    """Sampler steps (paper: 50)."""
     guidance: NonNegativeFloat = 3.0
     """Classifier-free guidance weight."""
-    guidance_interval: tuple[NonNegativeFloat, NonNegativeFloat] = (0.0, 1.0)
-    """Part of the diffusion time in which guidance is on, from 0 (data) to 1 (noise)."""
-    batch_groups: PositiveInt | None = None
-    """Groups sampled at once; None: as many as memory holds. Never changes the result."""
+    guidance_log_snr: tuple[FiniteFloat | None, FiniteFloat | None] = (None, None)
+    """Lowest and highest log-SNR at which guidance is on; None: no bound."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Of the network; the sampler's state is float32 always. bfloat16 is for GPUs."""
+
+
+class ExecutionConfig(_Model):
+    """Where and how generated views are worked on. Nothing here changes a result beyond rounding."""
+
+    executor: Literal["local", "dask"] = "local"
+    """`local`: processes on this machine; `dask`: a Dask cluster, through prefect-dask."""
+    workers: PositiveInt | None = None
+    """Processes; None: one per GPU, or without GPUs one per `threads` CPU cores."""
+    threads: PositiveInt = 1
+    """CPU threads of each worker."""
+    groups_at_once: PositiveInt = 1
+    """Groups in one evaluation of the network. With 1 results are bit-identical however the work is shared out."""
+    batch_seconds: PositiveFloat = 10.0
+    """Groups are handed out in batches that take about this long, by what was measured so far."""
+    timeout_s: PositiveFloat = 600.0
+    """A worker that finishes nothing for so long is given up and its work handed to another."""
+    attempts: PositiveInt = 3
+    """Workers that may die on one and the same group before the stage fails."""
+    dask_address: str | None = None
+    """Scheduler of a running Dask cluster, e.g. tcp://10.0.0.1:8786."""
+    dask_cluster: str | None = None
+    """Class of the cluster to start, e.g. dask_jobqueue.SLURMCluster; None: a LocalCluster on loopback."""
+    dask_options: dict[str, Any] = Field(default_factory=dict)
+    """Keyword arguments of that class."""
+    dask_resources: dict[str, NonNegativeFloat] = Field(default_factory=dict)
+    """Dask resources a batch occupies, e.g. {GPU: 1}; workers must be started with them."""
 
 
 class ReconstructConfig(_Model):
@@ -115,6 +163,8 @@ class RunConfig(_Model):
 
     method: Literal["zipnerf", "cat3d"] = "zipnerf"
     """`zipnerf` fits the captured views alone; `cat3d` generates views first."""
+    label: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,40}$")] | None = None
+    """Name of the variant in run names and tables; None: the method's name."""
     split: Annotated[str, Field(coerce_numbers_to_str=True)] = "all"
     """Captured views to train on: a count (1, 3, 6, 9), `all`, or the name of a split of the data set."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
@@ -126,6 +176,7 @@ class RunConfig(_Model):
     reconstruct: ReconstructConfig = Field(default_factory=ReconstructConfig)
     render: RenderConfig = Field(default_factory=RenderConfig)
     evaluate: EvaluateConfig = Field(default_factory=EvaluateConfig)
+    execution: ExecutionConfig = Field(default_factory=ExecutionConfig)
 
 
 class SceneSource(_Model):

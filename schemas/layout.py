@@ -3,7 +3,8 @@
     scene.zarr/  captured/  latents/  stages/<stage>/
                  runs/<run>/  plan/  generated/  field/  renders/<kind>/  stages/<stage>/
 
-V captured views, N planned views, R rendered views, M conditioning views, P points, C latent channels.
+V captured views, N planned views in G groups of up to S, R rendered views, M conditioning views, P points,
+C latent channels.
 Cameras are OpenCV (x right, y down, z forward); K in pixels of the stored image; pixel centres at integer + 0.5.
 """
 
@@ -66,6 +67,10 @@ LAYOUT: tuple[ArraySpec, ...] = (
     ArraySpec("latents/captured", "latent", "float16", ("V", "C", "h", "w"), "encode", "encoded captured views",
               done="latents/done_captured"),
     ArraySpec("latents/done_captured", "key", "uint8", ("V", 32), "encode", "content key of each latent, 0 = not done"),
+    ArraySpec("latents/captured_wide", "latent", "float16", ("V", "C", "h", "w"), "encode",
+              "the same of the views padded to squares, where wide samples are asked for",
+              done="latents/done_captured_wide"),
+    ArraySpec("latents/done_captured_wide", "key", "uint8", ("V", 32), "encode", "content key, 0 = not done"),
     ArraySpec("runs/*/role", "small", "uint8", ("V",), None, "role of each captured view, see ROLES"),
     ArraySpec("runs/*/plan/world_from_camera", "small", "float64", ("N", 4, 4), "plan", "scene frame"),
     ArraySpec("runs/*/plan/intrinsics", "small", "float64", ("N", 3, 3), "plan", "K in pixels"),
@@ -75,6 +80,16 @@ LAYOUT: tuple[ArraySpec, ...] = (
     ArraySpec("runs/*/plan/anchor", "small", "bool", ("N",), "plan", "sampled first and conditioned upon"),
     ArraySpec("runs/*/plan/condition", "small", "int32", ("N", "M"), "plan",
               "conditioning views: -1 none, below V captured view, V + n the planned view n (an anchor)"),
+    ArraySpec("runs/*/plan/path", "small", "int32", ("N",), "plan", "path of the trajectory the view is on"),
+    ArraySpec("runs/*/plan/pose", "small", "int32", ("N",), "plan",
+              "pose of the trajectory: equal for the square and the wide sample of one pose"),
+    ArraySpec("runs/*/plan/sample_kind", "small", "uint8", ("N",), "plan", "0 square, 1 wide (padded to a square)"),
+    ArraySpec("runs/*/plan/window", "small", "int32", ("N", 4), "plan",
+              "[x0, y0, width, height] of the sample that shows the scene and not its padding"),
+    ArraySpec("runs/*/plan/group_views", "small", "int32", ("G", "S"), "plan",
+              "views of each group in order, short groups filled with repeats; -1 beyond group_targets"),
+    ArraySpec("runs/*/plan/group_valid", "small", "bool", ("G", "S"), "plan", "False for repeats and beyond"),
+    ArraySpec("runs/*/plan/group_targets", "small", "int32", ("G",), "plan", "target views the network is given"),
     ArraySpec("runs/*/generated/latent", "latent", "float16", ("N", "C", "h", "w"), "sample", "sampled latents",
               done="runs/*/generated/done_latent"),
     ArraySpec("runs/*/generated/done_latent", "key", "uint8", ("N", 32), "sample", "content key, 0 = not done"),
