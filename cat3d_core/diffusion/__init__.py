@@ -9,7 +9,7 @@ from cat3d_core.diffusion.model import MultiViewModel
 from cat3d_core.diffusion.sampler import SamplerConfig, sample
 from cat3d_core.diffusion.schedule import Schedule
 from cat3d_core.diffusion.training import TrainConfig, Trainer, diffusion_loss
-from cat3d_core.diffusion.unet import MultiViewUNet, compile_blocks, count_parameters
+from cat3d_core.diffusion.unet import MultiViewUNet, compile_blocks, count_flops, count_parameters
 
 __all__ = [
     "SIZES",
@@ -28,6 +28,7 @@ __all__ = [
     "UNetConfig",
     "autoencoder_loss",
     "compile_blocks",
+    "count_flops",
     "count_parameters",
     "describe",
     "diffusion_loss",

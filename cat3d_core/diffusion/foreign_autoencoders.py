@@ -91,24 +91,17 @@ class _KLHalf(nn.Module):
             width = out
         setattr(self, "down_blocks" if encoder else "up_blocks", levels)
         middle = widths[-1] if encoder else widths[0]
-        self.mid_block = nn.Module()
-        self.mid_block.resnets = nn.ModuleList(ResnetBlock(middle, middle, None, groups, 1e-6) for _ in range(2))
-        self.mid_block.attentions = nn.ModuleList([_KLAttention(middle, groups)])
+        self.mid_block = _KLMiddle(middle, groups)
         self.conv_norm_out = nn.GroupNorm(groups, width, eps=1e-6)
         self.conv_out = nn.Conv2d(width, outputs, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
         x = self.conv_in(x)
         if self.is_encoder:
-            x = self._middle(self._levels(x, self.down_blocks, "downsamplers"))
+            x = self.mid_block(self._levels(x, self.down_blocks, "downsamplers"))
         else:
-            x = self._levels(self._middle(x), self.up_blocks, "upsamplers")
+            x = self._levels(self.mid_block(x), self.up_blocks, "upsamplers")
         out: Tensor = self.conv_out(F.silu(self.conv_norm_out(x)))
-        return out
-
-    def _middle(self, x: Tensor) -> Tensor:
-        first, second = self.mid_block.resnets
-        out: Tensor = second(self.mid_block.attentions[0](first(x)))
         return out
 
     @staticmethod
@@ -117,6 +110,17 @@ class _KLHalf(nn.Module):
             for block in [*level.resnets, *getattr(level, resample, [])]:
                 x = block(x)
         return x
+
+
+class _KLMiddle(nn.Module):
+    def __init__(self, channels: int, groups: int) -> None:
+        super().__init__()
+        self.resnets = nn.ModuleList(ResnetBlock(channels, channels, None, groups, 1e-6) for _ in range(2))
+        self.attentions = nn.ModuleList([_KLAttention(channels, groups)])
+
+    def forward(self, x: Tensor) -> Tensor:
+        out: Tensor = self.resnets[1](self.attentions[0](self.resnets[0](x)))
+        return out
 
 
 class _KLAttention(nn.Module):

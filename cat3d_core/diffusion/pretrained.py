@@ -85,7 +85,7 @@ def inflate(unet: MultiViewUNet, weights: dict[str, Tensor], text_token: Tensor 
         if text_token is not None:
             value = weights[f"{block}.attn2.to_v.weight"].float() @ text_token.float()
             bias = bias + weights[f"{block}.attn2.to_out.0.weight"].float() @ value
-        own[f"{block}.attn1.to_out.0.bias"] += bias
+        own[f"{block}.attn1.to_out.0.bias"].add_(bias)
     present = set(report.taken) | set(report.widened)
     report.fresh = [name for name in own if name not in present]
     return report

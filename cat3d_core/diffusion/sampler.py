@@ -40,8 +40,8 @@ def sample(
     """Latents of target views given conditioning views, for G independent groups.
 
     condition_latents [G, M, C, h, w]; raymaps [G, M+N, 6, h, w], conditioning views first, relative to the first of
-    them; noise [G, N, C, h, w] standard normal, keyed by view. Returns [G, N, C, h, w] float32 (float64 for float64 noise;
-    the network runs in the dtype of its weights).
+    them; noise [G, N, C, h, w] standard normal, keyed by view. Returns [G, N, C, h, w] float32 (float64 for float64
+    noise; the network runs in the dtype of its weights).
     Groups with fewer targets than the model was trained with (views - M) are padded with repeated targets, keeping the
     trained noise shift; the padding is dropped. Raises ValueError for shapes that don't fit together.
     """
@@ -67,7 +67,7 @@ def sample(
     results = []
     for start in range(0, groups, batch):
         index = torch.arange(start, start + batch).clamp(max=groups - 1)
-        part = _sample_batch(model, *(t[index.to(t.device)] for t in inputs), config)
+        part = _sample_batch(model, [t[index.to(t.device)] for t in inputs], config)
         results.append(part[: min(batch, groups - start), :targets])
     return torch.cat(results)
 
@@ -89,9 +89,8 @@ def _pad_targets(raymaps: Tensor, noise: Tensor, full: int) -> tuple[Tensor, Ten
 
 
 @torch.no_grad()
-def _sample_batch(
-    model: MultiViewModel, latents: Tensor, raymaps: Tensor, noise: Tensor, config: SamplerConfig
-) -> Tensor:
+def _sample_batch(model: MultiViewModel, inputs: list[Tensor], config: SamplerConfig) -> Tensor:
+    latents, raymaps, noise = inputs
     schedule = Schedule(model.config.schedule, noise.shape[1])
     nodes = schedule.nodes(config.nodes, config.steps)
     times = schedule.time(nodes).tolist()

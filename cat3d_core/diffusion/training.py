@@ -107,7 +107,7 @@ class Trainer:
         dtype = torch.bfloat16 if config.precision == "bfloat16" else torch.float32
         self.unet = copy.deepcopy(model.unet).to(self.device, dtype).train().requires_grad_(True)
         self.names = [name for name, _ in self.unet.named_parameters()]
-        self.weights = [p for _, p in self.unet.named_parameters()]
+        self.weights: list[Tensor] = [p for _, p in self.unet.named_parameters()]
         own = dict(model.unet.named_parameters())
         self.masters = [own[n].detach().to(self.device, torch.float32, copy=True) for n in self.names]
         self.ema = [m.clone() for m in self.masters]

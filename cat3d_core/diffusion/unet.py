@@ -157,6 +157,18 @@ def compile_blocks(unet: MultiViewUNet) -> None:
             module.compile()
 
 
+def count_flops(config: UNetConfig, views: int = 8) -> int:
+    """Floating-point operations (2 per multiply-add) of one evaluation of one group, counted without computing it."""
+    from torch.utils.flop_counter import FlopCounterMode
+
+    size = config.latent_size
+    with torch.device("meta"), torch.no_grad(), FlopCounterMode(display=False) as counter:
+        latents = torch.empty(1, views, config.latent_channels, size, size)
+        unet = MultiViewUNet(config)
+        unet(latents, torch.empty(1), torch.empty(1, views, 6, size, size), torch.empty(1, views))
+    return int(counter.get_total_flops())
+
+
 def count_parameters(config: UNetConfig) -> int:
     """Parameters of the U-Net, counted without allocating them."""
     with torch.device("meta"):

@@ -102,7 +102,8 @@ def model_problem(path: Path, groups: int = 2, given: int = 3) -> Problem:
         rays = raymap(cameras, cameras.world_from_camera[0], *latents.shape[-2:]).float()
         noise = torch.stack([normal(latents.shape[1:], 0, number, v, "noise") for v in range(given, len(latents))])
         parts.append((latents[:given], rays, noise))
-    return model, *(torch.stack(part) for part in zip(*parts, strict=True))
+    latents, raymaps, noise = (torch.stack(part) for part in zip(*parts, strict=True))
+    return model, latents, raymaps, noise
 
 
 def rows(
@@ -114,13 +115,13 @@ def rows(
     name, problem = ("mixture", mixture_problem(groups or 64))
     if model_path is not None:
         name, problem = "model", model_problem(model_path, groups or 2)
-    model = problem[0]
+    model, latents, raymaps, noise = problem
     references = {}
     model.unet.double()
     for interval, (low, high) in INTERVALS.items():
         solver, nodes, count = REFERENCE
         config = SamplerConfig(solver, nodes, count, GuidanceConfig(3.0, low, high))  # type: ignore[arg-type]
-        references[interval] = sample(model, *(t.double() for t in problem[1:]), config)
+        references[interval] = sample(model, latents.double(), raymaps.double(), noise.double(), config)
     result = []
     for dtype_name, dtype in DTYPES.items():
         model.unet.to(dtype)

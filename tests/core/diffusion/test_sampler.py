@@ -34,12 +34,12 @@ def _groups(groups: int, given: int = 3, targets: int = 5) -> tuple[torch.Tensor
 def test_results_do_not_depend_on_group_count_or_order(solver):
     """Within 1e-5 (float32) in one batch; bit for bit with micro-batches of one."""
     model = random_model()
-    latents, raymaps, noise = _groups(5)
-    order = torch.tensor([3, 0, 4, 2, 1])
+    latents, raymaps, noise = _groups(3)
+    order = torch.tensor([2, 0, 1])
     for micro, tolerance in ((None, 1e-5), (2, 1e-5), (1, 0.0)):
-        config = SamplerConfig(solver, steps=4, micro_batch=micro)
+        config = SamplerConfig(solver, steps=3, micro_batch=micro)
         full = sample(model, latents, raymaps, noise, config)
-        alone = torch.cat([sample(model, latents[i, None], raymaps[i, None], noise[i, None], config) for i in range(5)])
+        alone = torch.cat([sample(model, latents[i, None], raymaps[i, None], noise[i, None], config) for i in range(3)])
         shuffled = sample(model, latents[order], raymaps[order], noise[order], config)
         assert (full - alone).abs().max() <= tolerance
         assert (full[order] - shuffled).abs().max() <= tolerance
