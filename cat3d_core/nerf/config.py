@@ -135,7 +135,7 @@ _FAST = replace(
     _PAPER,
     batch_rays=1024,
     chunk_rays=1024,
-    patch_size=16,
+    patch_size=24,  # LPIPS networks need 16 to 31 pixels; ST-LPIPS AlexNet, the default here, 21
     patch_share=0.5,
     samples=(32, 16),
     grid_max=(128, 1024),
@@ -148,7 +148,7 @@ _FAST = replace(
 
 PRESETS: dict[str, ReconstructConfig] = {
     "tiny": replace(
-        _FAST, iterations=100, warmup_iterations=10, batch_rays=512, chunk_rays=512, patch_size=16,
+        _FAST, iterations=100, warmup_iterations=10, batch_rays=768, chunk_rays=768,
         samples=(16, 12), grid_max=(64, 128), grid_log2_table=14, multisamples=3,
     ),
     "fast": _FAST,

@@ -110,6 +110,7 @@ def normals_from_depth(depth: Tensor, rays: Rays) -> Tensor:
     Central differences of the back-projected points, the nearer neighbour at depth edges; 0 where they degenerate.
     """
     height, width = depth.shape
+    tiny = torch.finfo(depth.dtype).tiny
     points = (rays.origins + depth.reshape(-1, 1) * rays.directions).reshape(height, width, 3)
 
     def tangent(axis: int) -> Tensor:
@@ -117,12 +118,13 @@ def normals_from_depth(depth: Tensor, rays: Rays) -> Tensor:
         edge = torch.full_like(step.narrow(axis, 0, 1), torch.inf)
         after, before = torch.cat([step, edge], axis), torch.cat([edge, step], axis)
         shorter = after.norm(dim=-1, keepdim=True) <= before.norm(dim=-1, keepdim=True)
-        return torch.where(shorter, after, before)
+        # Of unit length, so that their product neither overflows far away nor underflows close by.
+        return torch.nn.functional.normalize(torch.where(shorter, after, before), dim=-1, eps=tiny)
 
     if min(height, width) < 2:
         return torch.zeros_like(points)
     normal = torch.linalg.cross(tangent(0), tangent(1))
-    normal = normal / normal.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(depth.dtype).tiny)
+    normal = normal / normal.norm(dim=-1, keepdim=True).clamp_min(tiny)
     away = (normal * rays.directions.reshape(height, width, 3)).sum(-1, keepdim=True) > 0
     return torch.where(away, -normal, normal)
 

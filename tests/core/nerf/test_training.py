@@ -200,7 +200,7 @@ def test_patches_with_a_perceptual_loss_and_generated_views_train() -> None:
         assert prediction.shape[1:] == (3, 16, 16)
         return (prediction - target).square().mean((1, 2, 3))
 
-    config = dataclasses.replace(TINY, batch_rays=1024, patch_share=0.5, chunk_rays=300, low_resolution_iterations=0)
+    config = dataclasses.replace(TINY, batch_rays=1024, patch_size=16, patch_share=0.5, chunk_rays=300)
     trainer = Trainer(config, _views(4, captured=2), seed=0, perceptual=distance)
     terms = [trainer.step() for _ in range(3)][-1]
     assert {"photometric", "distortion", "interlevel", "perceptual"} <= terms.keys()
