@@ -13,8 +13,11 @@ from torch import Tensor
 
 from cat3d_core.cameras import Cameras
 
-# Optical axes must spread by this much (radians) before their intersection is believed.
+# Optical axes must spread by this much (radians, rms) before their intersection is believed at all ...
 MIN_CONVERGENCE = 0.05
+# ... and by this much before it is believed more than known depths: cameras round an object stand at the object's
+# distance, while the median depth of the points is that of the room.
+STRONG_CONVERGENCE = 0.25
 # Looked-at distance in units of the cameras' extent where nothing else is known (nearly parallel axes, no depth).
 PARALLEL_DEPTH_FACTOR = 4.0
 
@@ -56,9 +59,10 @@ def normalize_scene(cameras: Cameras, points: Tensor | None = None, depth_bounds
     every similarity g (points and depth bounds moved along).
 
     How the looked-at distance d is found, in this order:
+      "convergence" the least-squares intersection of the optical axes, where they spread by STRONG_CONVERGENCE;
       "points"      the median depth of the points seen inside the images (at least 8 of them);
       "bounds"      the harmonic mean of near and far, median over cameras;
-      "convergence" the least-squares intersection of the optical axes, where they converge in front of the cameras;
+      "convergence" again, where the axes spread by MIN_CONVERGENCE;
       "extent"      PARALLEL_DEPTH_FACTOR times the rms distance of the cameras from their mean;
       "unit"        1 (a single camera, nothing known).
     Raises ValueError for no cameras or non-finite ones.
@@ -73,11 +77,14 @@ def normalize_scene(cameras: Cameras, points: Tensor | None = None, depth_bounds
     mean_forward = _mean_direction(cams.forward)
 
     depth, method = None, "unit"
-    if points is not None and len(points) >= 8:
-        depth, method = _median_seen_depth(cams, points.double()), "points"
-    if depth is None and depth_bounds is not None:
-        depth, method = _bounds_depth(depth_bounds.double()), "bounds"
     focus = axes_intersection(cams)
+    strong = focus is not None and _axes_spread(cams.forward) > STRONG_CONVERGENCE
+    if not strong and points is not None and len(points) >= 8:
+        depth, method = _median_seen_depth(cams, points.double()), "points"
+    if not strong and depth is None and depth_bounds is not None:
+        depth, method = _bounds_depth(depth_bounds.double()), "bounds"
+    if depth is not None:
+        focus = None  # weakly converging axes put the looked-at point anywhere along them; the depth says where
     if depth is None:
         if focus is not None:
             depth, method = float((cams.centers - focus).norm(dim=-1).mean()), "convergence"
@@ -103,7 +110,7 @@ def axes_intersection(cameras: Cameras) -> Tensor | None:
     if len(cameras) < 2:
         return None
     centers, forward = cameras.centers.double(), cameras.forward.double()
-    spread = torch.acos((forward @ _mean_direction(forward)).clamp(-1, 1)).square().mean().sqrt()
+    spread = _axes_spread(forward)
     off_axis = torch.eye(3, dtype=torch.float64, device=centers.device) - forward[:, :, None] * forward[:, None, :]
     system = off_axis.sum(0)
     if spread < MIN_CONVERGENCE or torch.linalg.cond(system) > 1e6:
@@ -118,6 +125,11 @@ def axes_intersection(cameras: Cameras) -> Tensor | None:
     distance = to_focus.norm(dim=-1)
     in_front = (along > 0).double().mean() >= 0.8
     return focus if in_front and beside.median() < 0.5 * distance.median() else None
+
+
+def _axes_spread(forward: Tensor) -> Tensor:
+    """Rms angle (radians) of viewing directions to their mean."""
+    return torch.acos((forward @ _mean_direction(forward)).clamp(-1, 1)).square().mean().sqrt()
 
 
 def _mean_direction(directions: Tensor) -> Tensor:
