@@ -74,9 +74,9 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     record = []
     saved = started = time.monotonic()
     with meter(f"reconstruct {job.scene_id} {job.run}", config.iterations) as progress:
-        while not _finished(trainer):
+        while not trainer.finished:
             step = trainer.step()
-            if trainer.iteration % 10 == 0 or _finished(trainer):
+            if trainer.iteration % 10 == 0 or trainer.finished:
                 record.append([trainer.iteration, time.monotonic() - started, step["loss"], step["psnr"]])
             progress.update(trainer.iteration, f"{step['psnr']:.1f} dB")
             if time.monotonic() - saved > CHECKPOINT_INTERVAL_S:
@@ -90,11 +90,6 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     checkpoint.remove()
     rays = (trainer.iteration - resumed) * config.batch_rays
     return Outcome({"views": len(views), "steps": trainer.iteration - resumed, "rays": rays}, decisions)
-
-
-def _finished(trainer: Trainer) -> bool:
-    # `converged` is the early stop on a plateau of the held-out loss (plateau_patience).
-    return trainer.iteration >= trainer.config.iterations or getattr(trainer, "converged", False)
 
 
 def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[str]]:
