@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -28,9 +29,7 @@ def run(
         str, typer.Option(help="Training views: counts with a split of the data set, or all; several by commas.")
     ] = "all",
     downscale: Annotated[float, typer.Option(help="Divide image width and height by this.")] = 1,
-    method: Annotated[
-        str, typer.Option(help="zipnerf: captured views only; cat3d: with generated views.")
-    ] = "zipnerf",
+    method: Annotated[str, typer.Option(help="zipnerf: captured views only; cat3d: with generated views.")] = "zipnerf",
     preset: Annotated[str, typer.Option(help="reconstruction preset: tiny, fast, balanced, paper.")] = "fast",
     seed: Annotated[int, typer.Option(help="All randomness follows from it.")] = 0,
     reader: Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")] = "auto",
@@ -56,6 +55,30 @@ def demo(
     from flows.run_command import demo_command
 
     demo_command(out, smallest)
+
+
+@app.command()
+def plan(
+    source: Annotated[str, typer.Argument(help="A scene's folder, or procedural:FAMILY/SEED.")],
+    out: OutOption = Path("outputs"),
+    views: Annotated[str, typer.Option(help="Training views, as for run.")] = "all",
+    trajectory: Annotated[
+        str, typer.Option(help="auto, single_spiral, single_orbit, realestate10k, llff, dtu, co3d or mipnerf360.")
+    ] = "auto",
+    count: Annotated[int | None, typer.Option(help="Views to generate; without it the recipe's own number.")] = None,
+    downscale: Annotated[float, typer.Option(help="Divide image width and height by this.")] = 1,
+    seed: Annotated[int, typer.Option(help="All randomness follows from it.")] = 0,
+    reader: Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")] = "auto",
+    images: Annotated[str | None, typer.Option(help="Image folder inside the scene, where there are several.")] = None,
+    config: Annotated[Path | None, typer.Option(help="Settings from a YAML or JSON file; options here win.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="One setting, as for run. May be repeated.")] = None,
+    rows: Annotated[int, typer.Option(help="Groups to print at most.")] = 24,
+) -> None:
+    """Which views would be generated, how they are grouped and on what they are conditioned: a table and a picture."""
+    from flows.plan_command import plan_command
+
+    given = {"downscale": downscale, "seed": seed, "trajectory": trajectory, "count": count}
+    plan_command(source, out, views.split(","), given, reader, images, config, set_ or [], rows)
 
 
 @app.command()
@@ -120,6 +143,9 @@ def results(
 
 def main() -> None:
     """Entry point: errors a user can act on end in one sentence and exit code 1, without a traceback."""
+    # Before torch and Prefect are imported: no busy-waiting threads on shared machines, no log lines between ours.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("PREFECT_LOGGING_LEVEL", "CRITICAL")
     from flows.errors import describe
 
     try:

@@ -10,8 +10,9 @@ from schemas.errors import ConfigError, StoreError
 def describe(error: BaseException) -> str | None:
     """The sentence a user sees, or None for a fault of ours, which deserves its traceback."""
     from cat3d_core.nerf import NonFiniteError
+    from flows.sampling.work import WorkerError
 
-    if isinstance(error, (InputError, StoreError, ConfigError, ServerError, NonFiniteError)):
+    if isinstance(error, (InputError, StoreError, ConfigError, ServerError, NonFiniteError, WorkerError)):
         return str(error)
     if isinstance(error, OSError) and error.errno is not None:
         where = f" ({error.filename})" if error.filename else ""

@@ -204,15 +204,11 @@ def reprocess_command(
     if dry_run:
         return problems
     with prefect_server(out / ".prefect"):
-        _reprocess_flow()(found, from_stage)
+        from prefect import Flow
+
+        Flow(redo, name="cat3d-reprocess", validate_parameters=False)(found, from_stage)
     write_report(out)
     return problems
-
-
-def _reprocess_flow() -> Any:
-    from prefect import flow
-
-    return flow(redo, name="cat3d-reprocess", validate_parameters=False)
 
 
 def recover(out: Path) -> None:

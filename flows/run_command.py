@@ -21,6 +21,8 @@ OPTION_FIELDS = {
     "method": ("method",),
     "preset": ("reconstruct", "preset"),
     "seed": ("seed",),
+    "trajectory": ("plan", "trajectory"),
+    "count": ("plan", "views"),
 }
 DEMO_SOURCE = "procedural:llff/1"
 

@@ -156,5 +156,3 @@ def writing(store_path: Path, scene_id: str) -> Iterator[None]:
         file.write(str(os.getpid()))
         file.flush()
         yield
-
-

@@ -82,7 +82,8 @@ def prefect_server(home: Path) -> Iterator[str]:
             raise ServerError(f"{error} Its log is {log_path}.") from None
         _save_template(home / "prefect.db", template)
         os.environ["PREFECT_API_URL"] = url
-        yield url
+        with _settings_of_environment():
+            yield url
     finally:
         _stop(process)
         if previous is not None:
@@ -92,6 +93,20 @@ def prefect_server(home: Path) -> Iterator[str]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+@contextlib.contextmanager
+def _settings_of_environment() -> Iterator[None]:
+    """Prefect reads its environment when it is imported; where that has happened already, make it read again."""
+    if "prefect" not in sys.modules:
+        yield
+        return
+    from prefect.context import SettingsContext, get_settings_context
+    from prefect.settings import Settings
+
+    profile = get_settings_context().profile
+    with SettingsContext(profile=profile, settings=Settings()):
+        yield
 
 
 def _die_with_parent() -> None:

@@ -82,7 +82,7 @@ def run_scene(scene_id: str, jobs: list[dict[str, Any]]) -> dict[str, str]:
 @flow(name="cat3d-sweep", validate_parameters=False)
 def _sweep(scenes: list[list[dict[str, Any]]]) -> list[str]:
     futures = [(jobs[0]["scene_id"], run_scene.submit(jobs[0]["scene_id"], jobs)) for jobs in scenes]
-    problems = []
+    problems: list[str] = []
     for scene_id, future in futures:
         try:
             problems += future.result().values()
@@ -104,7 +104,7 @@ def run_sweep(config: SweepConfig, out: Path) -> list[str]:
     out.mkdir(parents=True, exist_ok=True)
     (out / "sweep.json").write_text(json.dumps(config.model_dump(mode="json"), indent=1))
     if todo:
-        runner = ProcessPoolTaskRunner(config.workers) if config.workers > 1 else ThreadPoolTaskRunner(1)
+        runner: Any = ProcessPoolTaskRunner(config.workers) if config.workers > 1 else ThreadPoolTaskRunner(1)
         with prefect_server(out / ".prefect"):
             documents = [[job.model_dump(mode="json") for job in jobs] for jobs in todo]
             problems += _sweep.with_options(task_runner=runner)(documents)

@@ -65,8 +65,9 @@ def write_captured(store: SceneStore, capture: Capture, views: list[Ingested]) -
         captured.write_images("mask", full, range(len(views)))
     else:
         captured.remove("mask")
-    if all(v.intrinsics is not None for v in views):
-        captured.write("intrinsics", torch.stack([v.intrinsics for v in views]).numpy())
+    known = [v.intrinsics for v in views if v.intrinsics is not None]
+    if len(known) == len(views):
+        captured.write("intrinsics", torch.stack(known).numpy())
     else:
         captured.remove("intrinsics")
 
@@ -88,8 +89,9 @@ def ingest_view(
     else:
         image, alpha = images.read_image(capture.paths[view], max_pixels=settings.max_pixels)
     mask = alpha
-    if capture.masks and capture.masks[view] is not None:
-        mask = images.read_mask(capture.masks[view])
+    mask_path = capture.masks[view] if capture.masks else None
+    if mask_path is not None:
+        mask = images.read_mask(mask_path)
         if mask.shape != image.shape[:2]:
             mask = images.resize(mask, image.shape[1], image.shape[0])
     height, width = image.shape[:2]
@@ -112,5 +114,5 @@ def ingest_view(
     image = images.resize(image, small_width, small_height)
     if mask is not None:
         mask = images.resize(mask, small_width, small_height)
-    intrinsics = camera.resize(small_width, small_height).intrinsics[0] if camera is not None else None
-    return Ingested(image, mask, intrinsics)
+    small = None if camera is None else camera.resize(small_width, small_height).intrinsics[0]
+    return Ingested(image, mask, small)

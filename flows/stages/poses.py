@@ -71,14 +71,17 @@ def _estimate(
         camera = result.cameras[i]
         lens = result.distortion[i] if result.distortion is not None and view in row else None
         if view not in row:  # an unplaced photo may have another size; its camera is a stand-in of the right shape
-            image = photos[view] if capture.images is not None else images.image_size(photos[view])
-            width, height = (image.shape[1], image.shape[0]) if isinstance(image, np.ndarray) else image
+            if capture.images is not None:
+                height, width = capture.images[view].shape[:2]
+            else:
+                width, height = images.image_size(capture.paths[view])
             camera = camera.resize(width, height)
         views.append(ingest_view(capture, view, job.config.ingest, lens, camera))
     write_captured(store, capture, views)
     size = torch.from_numpy(store.captured.read("size").astype(np.int64))
     poses = torch.stack([result.cameras.world_from_camera[row.get(v, 0)] for v in range(len(capture))])
-    cameras = Cameras(torch.stack([v.intrinsics for v in views]), orthonormalize(poses), size)
+    intrinsics = torch.from_numpy(store.captured.read("intrinsics"))
+    cameras = Cameras(intrinsics, orthonormalize(poses), size)
     points = result.points if len(result.points) else None
     return cameras, registered, points, [result.report.summary()]
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
+from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+import numpy as np
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
@@ -39,7 +42,7 @@ def trainer_config(job: Job) -> ReconstructConfig:
             f"reconstruct.overrides: {unknown[0]} is not a setting of the trainer; "
             f"those are {', '.join(sorted(known))}."
         )
-    values = {n: tuple(v) if isinstance(v, list) else v for n, v in settings.overrides.items()}
+    values: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in settings.overrides.items()}
     try:
         return dataclasses.replace(config, **values)
     except (ValueError, TypeError) as error:
@@ -101,16 +104,20 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[s
     if job.config.method == "zipnerf":
         decisions.append("No views were generated: method zipnerf trains on captured views alone.")
     else:
-        shown = run.generated.read("done_image").any(-1).nonzero()[0].tolist()
-        cameras = Cameras.cat([cameras, read_cameras(run.plan, shown).resize(*_image_size(run))])
-        images += [torch.from_numpy(image) for image in run.generated.read("image", shown)]
+        for camera, image in generated_views(run):
+            cameras = Cameras.cat([cameras, camera])
+            images.append(image)
     captured = torch.arange(len(cameras)) < len(train)
     return Views(cameras, images, captured), decisions
 
 
-def _image_size(run: Run) -> tuple[int, int]:
-    _, height, width, _ = run.generated.shape("image")
-    return width, height
+def generated_views(run: Run) -> Iterator[tuple[Cameras, torch.Tensor]]:
+    """The generated views that are there: camera and (h, w, 3) uint8 image of the part that isn't padding."""
+    shown = np.flatnonzero(run.generated.read("done_image").any(-1)).tolist()
+    cameras, windows = read_cameras(run.plan, shown), run.plan.read("window", shown).tolist()
+    for i, (view, (x0, y0, width, height)) in enumerate(zip(shown, windows, strict=True)):
+        image = run.generated.read("image", [view])[0, y0 : y0 + height, x0 : x0 + width]
+        yield cameras[i].crop(x0, y0, width, height), torch.from_numpy(np.ascontiguousarray(image))
 
 
 def write_field(run: Run, field: Field, record: list[list[float]]) -> None:
@@ -160,4 +167,3 @@ class Checkpoint:
     def remove(self) -> None:
         """The stage is complete; the state is no longer needed."""
         self.path.unlink(missing_ok=True)
-

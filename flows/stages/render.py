@@ -41,9 +41,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     return Outcome({"views": total, "rays": rays}, decisions)
 
 
-def render_views(
-    section: Section, field: Field, cameras: Cameras, views: list[int], key: str, progress: Meter
-) -> int:
+def render_views(section: Section, field: Field, cameras: Cameras, views: list[int], key: str, progress: Meter) -> int:
     """Render the cameras that are not done yet under `key`; the number of rays cast."""
     width, height = (int(s) for s in cameras.size.max(0).values)
     section.create_array("image", (len(cameras), height, width, 3))

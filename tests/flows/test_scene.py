@@ -125,7 +125,9 @@ def test_killed_at_random_moments_it_ends_with_the_uninterrupted_result(finished
     arguments = command("run", SCENE, "--out", str(tmp_path), *TINY)
     own_server = {k: v for k, v in environment().items() if k != "PREFECT_API_URL"}
     for kind in (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGKILL, signal.SIGKILL, signal.SIGTERM):
-        process = subprocess.Popen(arguments, cwd=ROOT, env=own_server, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        process = subprocess.Popen(
+            arguments, cwd=ROOT, env=own_server, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+        )
         time.sleep(rng.uniform(2, 25))
         process.send_signal(kind)
         _, errors = process.communicate(timeout=60)
@@ -183,7 +185,9 @@ def test_only_one_command_writes_a_store(tmp_path: Path) -> None:
         (["fly"], 2, "No such command"),
     ],
 )
-def test_bad_requests_end_in_a_sentence_and_an_exit_code(arguments, code: int, sentence: str, tmp_path: Path, capsys) -> None:
+def test_bad_requests_end_in_a_sentence_and_an_exit_code(
+    arguments, code: int, sentence: str, tmp_path: Path, capsys
+) -> None:
     from unittest import mock
 
     from flows import cli

@@ -83,7 +83,9 @@ def test_ablations_and_seeds_are_runs_of_their_own(tmp_path: Path) -> None:
     assert scenes[0][2].config.reconstruct.overrides == TRAINER | {"weight_decay": 0.0}
 
 
-@pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "flows" / "sweeps").glob("*.yaml")), ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", sorted((Path(__file__).parents[2] / "flows" / "sweeps").glob("*.yaml")), ids=lambda p: p.stem
+)
 def test_shipped_sweeps_are_valid(path: Path) -> None:
     config = parse_config(yaml.safe_load(path.read_text()), path.name, SweepConfig)
     for label, settings in config.methods.items():
