@@ -140,10 +140,10 @@ class Field(nn.Module):
         return field
 
     def density(
-        self, round_index: int, rays: Rays, t: Tensor, generator: torch.Generator | None = None
+        self, round_index: int, rays: Rays, t: Tensor, multisamples: int, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor]:
         """Density (R, N) per unit length and hidden units (R, N, width) of the intervals with edges t (R, N+1)."""
         with torch.no_grad():
-            means, std = cone_samples(*rays, t, self.config.multisamples, generator)
+            means, std = cone_samples(*rays, t, multisamples, generator)
         density, hidden = self.grids[round_index](means, std)
         return density, hidden

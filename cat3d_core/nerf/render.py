@@ -63,13 +63,14 @@ def render_rays(
     anneal: float = 1.0,
     generator: torch.Generator | None = None,
     train_proposals: bool = True,
+    config: ReconstructConfig | None = None,
 ) -> RayRender:
     """Render rays. With a generator (training): jittered samples, random spirals and a random grey background per ray.
 
     anneal in [0, 1] is the exponent of the weights that steer the next round (mip-NeRF 360 sec. 4). Distances carry no
     gradient (Zip-NeRF's stop_level_grad).
     """
-    config = field.config
+    config = config or field.config
     count = len(rays.origins)
     s = torch.tensor([0.0, 1.0], device=rays.origins.device).expand(count, 2)
     logits = torch.zeros_like(s[:, :1])
@@ -80,7 +81,7 @@ def render_rays(
         t = t_from_s(s, config.near, config.far, config.distance_power, config.distance_premult)
         final = index == config.rounds - 1
         with torch.set_grad_enabled(torch.is_grad_enabled() and (final or train_proposals)):
-            density, hidden = field.density(index, rays, t, generator)
+            density, hidden = field.density(index, rays, t, config.multisamples, generator)
             weights = weights_from_density(density, t, rays.directions)
         rounds.append(Round(s, t, weights))
         # The smallest normal number, not 0: a ray without any weight keeps finite logits.
@@ -111,7 +112,8 @@ def normals_from_depth(depth: Tensor, rays: Rays) -> Tensor:
     """
     height, width = depth.shape
     tiny = torch.finfo(depth.dtype).tiny
-    points = (rays.origins + depth.reshape(-1, 1) * rays.directions).reshape(height, width, 3)
+    # Relative to the one camera centre, so that close surfaces do not drown in the rounding of its position.
+    points = (depth.reshape(-1, 1) * rays.directions).reshape(height, width, 3)
 
     def tangent(axis: int) -> Tensor:
         step = points.diff(dim=axis)
@@ -142,7 +144,8 @@ def render_image(
     """Render one camera (normalised scene) on the field's device, `chunk` rays at a time, at a scaled resolution.
 
     The depth is z-depth in normalised scene units. `on_progress` is called with the finished share; an exception that
-    it raises stops the rendering. `config` defaults to the field's own, to which it must be equal in all but speed.
+    it raises stops the rendering. `config`: how to sample the rays (samples, multisamples, near, far, background); the
+    field's own by default, for example fewer samples for a preview.
     """
     device = field.colour.rgb.weight.device
     width, height = (max(1, round(float(side) * resolution_scale)) for side in cameras.size[view_index])
@@ -151,7 +154,7 @@ def render_image(
     parts = []
     for first in range(0, len(rays.origins), chunk):
         piece = Rays(*(part[first : first + chunk] for part in rays))
-        out = render_rays(field, piece)
+        out = render_rays(field, piece, config=config)
         last = out.rounds[-1]
         parts.append((out.rgb, out.opacity, stepfun.quantile(last.t, last.weights, 0.5), expected_depth(last)))
         if on_progress is not None:

@@ -44,7 +44,6 @@ class Trainer:
         self.config, self.seed, self.perceptual = config, seed, perceptual
         self.device = torch.device(device)
         self.views = views.to(self.device)
-        self._coarse = views.halved().to(self.device) if config.low_resolution_iterations else None
         self.field = Field(config, seed).to(self.device)
         parameters: dict[str, Tensor] = dict(self.field.named_parameters())
         decay = {
@@ -60,6 +59,7 @@ class Trainer:
             generator = torch.Generator(self.device).manual_seed(derive_seed(seed, "nerf", "held out"))
             self._held_out = draw_batch(self.views, config.plateau_pixels, 1, 1.0, generator)
             self.views = self.views.without(self._held_out)
+        self._coarse = self.views.halved() if config.low_resolution_iterations else None
 
     @property
     def converged(self) -> bool:

@@ -86,7 +86,7 @@ class Views:
                     : 2 * height, : 2 * width
                 ]
                 masks.append(functional.avg_pool2d(valid[None].float(), 2)[0] == 1)
-        return Views(Cameras.cat(cameras), images, self.captured, masks or None)
+        return Views(Cameras.cat(cameras), images, self.captured, masks or None).to(self.pixels.device)
 
     def without(self, batch: Batch) -> Views:
         """These views with the pixels of a batch masked out."""

@@ -275,5 +275,17 @@ def test_rendering_is_deterministic_and_reports_progress() -> None:
     for a, b in zip(vars(first).values(), vars(second).values(), strict=True):
         assert torch.isfinite(a).all()
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-3)
+    preview = render_image(field, trainer.views.cameras, 1, dataclasses.replace(TINY, samples=(8, 6)))
+    assert torch.isfinite(preview.image).all()
     small = render_image(field, trainer.views.cameras, 1, TINY, resolution_scale=0.5)
     assert small.depth.shape == (10, 12)
+
+
+@pytest.mark.parametrize("distance", [1e-9, 1e-3, 1.0, 1e6, 1e12])
+def test_normals_of_a_plane_at_any_distance(distance: float) -> None:
+    """Found by `cat3d stress`: the product of two steps overflowed beyond 1e10 and underflowed below 1e-9 (float32)."""
+    camera = _cameras(1)
+    rays = image_rays(camera, 0)
+    rays = rays._replace(origins=torch.zeros_like(rays.origins))  # next to an origin at 1, 1e-9 would be rounding
+    normals = normals_from_depth(torch.full((20, 24), distance), rays)
+    torch.testing.assert_close(normals, (-camera.forward[0]).expand(20, 24, 3), rtol=0, atol=1e-4)
