@@ -64,16 +64,13 @@ class MixtureNetwork(nn.Module):
         )
 
     def _log_snr(self, step: float) -> Tensor:
-        """The inverse of Schedule.time: linear in log-SNR, in alpha just before pure noise."""
+        """The inverse of Schedule.time (input 'noise'): linear in log-SNR, in alpha just before pure noise."""
         table, last = self.schedule.base_log_snr, self.schedule.config.steps - 1
-        shift = table[0] - self.schedule.log_snr[0]
         low = min(int(step), last - 1)
         if torch.isinf(table[low + 1]):
             alpha = (last - step) * float(alpha_sigma(table[low])[0])
-            base = torch.tensor(2 * math.log(alpha) - math.log1p(-(alpha**2)) if alpha > 0 else -math.inf).double()
-        else:
-            base = table[low] + (step - low) * (table[low + 1] - table[low])
-        return base - shift
+            return torch.tensor(2 * math.log(alpha) - math.log1p(-(alpha**2)) if alpha > 0 else -math.inf).double()
+        return table[low] + (step - low) * (table[low + 1] - table[low])
 
 
 def mixture_problem(groups: int = 64, given: int = 3) -> Problem:
