@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import numpy as np
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file

@@ -1,0 +1,112 @@
+"""Workers of a Dask cluster, reached through prefect-dask: on this machine, over SSH, SLURM, Kubernetes.
+
+A batch is a Prefect task that runs on the cluster. Workers share the file system of the stores, have cat3d installed,
+reach the Prefect server (PREFECT_API_URL), and are started with the resources that `dask_resources` names.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+from typing import Any
+
+import distributed
+import torch
+from distributed.scheduler import KilledWorker
+from prefect import task
+from prefect.cache_policies import NO_CACHE
+from prefect_dask.client import PrefectDaskClient
+
+from flows.sampling.local import visible_gpus
+from flows.sampling.work import Answer, Batch, run_batch
+from schemas.config import ExecutionConfig
+from schemas.errors import ConfigError
+
+
+@task(name="cat3d-batch", task_run_name="{label}", cache_policy=NO_CACHE, persist_result=False)
+def dask_batch(document: str, label: str) -> str:
+    """Do a batch on a Dask worker. JSON in, JSON out."""
+    name = distributed.get_worker().name
+    if torch.cuda.is_available() and isinstance(name, int):  # a local cluster's workers see every GPU
+        torch.cuda.set_device(name % torch.cuda.device_count())
+    return run_batch(Batch.model_validate_json(document)).model_dump_json()
+
+
+class DaskExecutor:
+    """A cluster of its own, or a running one. Dask itself gives a dead worker's batch to another worker."""
+
+    def __init__(self, settings: ExecutionConfig) -> None:
+        self.resources = dict(settings.dask_resources)
+        self.exclusive = settings.dask_address is None
+        self.cluster = None if settings.dask_address else make_cluster(settings)
+        self.client = PrefectDaskClient(settings.dask_address or self.cluster, set_as_default=False)
+        if self.cluster is None:
+            self.client.wait_for_workers(1, timeout=settings.timeout_s)
+        self.futures: dict[int, distributed.Future] = {}
+
+    def slots(self) -> int:
+        """One batch a worker, of those that have the resources; at least one, as a cluster may only be starting."""
+        workers = self.client.scheduler_info(n_workers=-1)["workers"].values()
+        able = [w for w in workers if all(w["resources"].get(n, 0) >= v for n, v in self.resources.items())]
+        return max(1, len(able))
+
+    def submit(self, batch: Batch) -> None:
+        self.futures[batch.number] = self.client.submit(
+            dask_batch, batch.model_dump_json(), f"{batch.stage} {batch.job.scene_id} {batch.number}",
+            resources=self.resources or None, pure=False,
+        )  # fmt: skip
+
+    def answers(self, timeout_s: float) -> list[Answer]:
+        try:
+            distributed.wait(list(self.futures.values()), timeout=timeout_s, return_when="FIRST_COMPLETED")
+        except distributed.TimeoutError:
+            return []
+        finished = [number for number, future in self.futures.items() if future.done()]
+        return [_answer(number, self.futures.pop(number)) for number in finished]
+
+    def take_back(self, batch: Batch) -> None:
+        future = self.futures.pop(batch.number)
+        holders = [address for address, keys in self.client.processing().items() if future.key in keys]
+        future.cancel(force=True)
+        if holders:
+            self.client.restart_workers(holders, timeout=60, raise_for_error=False)
+
+    def close(self) -> None:
+        for future in self.futures.values():
+            future.cancel(force=True)
+        self.client.close()
+        if self.cluster is not None:
+            self.cluster.close()
+
+
+def make_cluster(settings: ExecutionConfig) -> Any:
+    """Start the cluster the settings name. Raises ConfigError for a class that isn't there."""
+    count = settings.workers or len(visible_gpus()) or max(1, len(os.sched_getaffinity(0)) // settings.threads)
+    if settings.dask_cluster is None:
+        # Loopback only: by default the dashboard and, without processes, a worker port listen on all addresses.
+        defaults = {
+            "n_workers": count, "threads_per_worker": 1, "processes": True, "host": "127.0.0.1",
+            "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL, "resources": settings.dask_resources,
+        }  # fmt: skip
+        return distributed.LocalCluster(**(defaults | settings.dask_options))
+    module, _, name = settings.dask_cluster.rpartition(".")
+    try:
+        kind = getattr(importlib.import_module(module), name)
+    except (ImportError, ValueError, AttributeError):
+        raise ConfigError(
+            f"execution.dask_cluster: there is no {settings.dask_cluster} here; install its package or correct it."
+        ) from None
+    cluster = kind(**settings.dask_options)
+    if settings.workers:
+        cluster.scale(settings.workers)
+    return cluster
+
+
+def _answer(number: int, future: distributed.Future) -> Answer:
+    if future.status == "finished":
+        return Answer.model_validate_json(future.result())
+    error = future.exception() if future.status == "error" else None
+    if error is None or isinstance(error, KilledWorker):
+        return Answer(number=number, died=f"of the Dask cluster was lost ({error or future.status})")
+    return Answer(number=number, error=type(error).__name__, message=f"A batch failed on the Dask cluster: {error}")

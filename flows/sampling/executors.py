@@ -1,0 +1,46 @@
+"""Where batches run: an interface small enough for processes of this machine and for a cluster alike."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+from flows.sampling.work import Answer, Batch
+from schemas.config import ExecutionConfig
+
+
+class Executor(Protocol):
+    """Workers that take one batch at a time. `exclusive`: after `close`, none of them can be writing any more."""
+
+    exclusive: bool
+
+    def slots(self) -> int:
+        """Batches that can be worked on at once, as of now."""
+        ...
+
+    def submit(self, batch: Batch) -> None:
+        """Hand a batch out; only while fewer than `slots()` are out."""
+        ...
+
+    def answers(self, timeout_s: float) -> list[Answer]:
+        """What came back, waiting at most timeout_s for something to come."""
+        ...
+
+    def take_back(self, batch: Batch) -> None:
+        """Give up the worker that has this batch, hanging as it may be; no answer to it will count."""
+        ...
+
+    def close(self) -> None:
+        """End all workers, whatever they are doing."""
+        ...
+
+
+def open_executor(settings: ExecutionConfig, log_folder: Path) -> Executor:
+    """The executor the settings ask for. log_folder: for the logs of workers."""
+    if settings.executor == "dask":
+        from flows.sampling.dask_executor import DaskExecutor  # takes a second to import
+
+        return DaskExecutor(settings)
+    from flows.sampling.local import LocalExecutor
+
+    return LocalExecutor(settings, log_folder)

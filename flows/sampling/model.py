@@ -1,0 +1,83 @@
+"""The multi-view model a job samples with: which file, what it is, and one copy of it in each process."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cat3d_core.diffusion import GuidanceConfig, MultiViewModel, SamplerConfig, describe, load_model
+from cat3d_core.diffusion.config import ModelConfig, from_dict
+from cat3d_core.weights import default_model_path
+from flows.jobs import Job
+from flows.readers.base import InputError
+
+
+def checkpoint_path(job: Job) -> Path:
+    """The model file of the job. Raises InputError where there is none."""
+    given = job.config.sample.checkpoint
+    try:
+        path = given or default_model_path()
+    except FileNotFoundError as error:
+        raise InputError(f"{error} The setting for that is sample.checkpoint.") from None
+    if not path.is_file():
+        raise InputError(f"sample.checkpoint: there is no model file {path}.")
+    return path.resolve()
+
+
+def model_config(job: Job) -> ModelConfig:
+    """The model's configuration, read without its weights. Raises InputError for a file that is no model."""
+    return from_dict(ModelConfig, _description(job)["config"])
+
+
+def model_hash(job: Job) -> str:
+    """SHA-256 of the model's weights, as recorded in its file."""
+    return str(_description(job)["sha256"])
+
+
+def _description(job: Job) -> dict[str, Any]:
+    path = checkpoint_path(job)
+    return _described(path, path.stat().st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=4)
+def _described(path: Path, _changed: int) -> dict[str, Any]:
+    try:
+        return describe(path)
+    except ValueError as error:
+        raise InputError(f"sample.checkpoint: {error}") from None
+
+
+def shared_model(job: Job) -> MultiViewModel:
+    """The job's model on this process's device; loaded and checked against its hash once a process."""
+    path = checkpoint_path(job)
+    return _loaded(path, path.stat().st_mtime_ns, device(), job.config.sample.precision)
+
+
+@functools.lru_cache(maxsize=1)
+def _loaded(path: Path, _changed: int, where: str, precision: str) -> MultiViewModel:
+    try:
+        model = load_model(path, where)
+    except ValueError as error:
+        raise InputError(f"sample.checkpoint: {error}") from None
+    model.unet.to(getattr(torch, precision))  # the autoencoder stays in float32
+    return model
+
+
+def device() -> str:
+    """This process's device. A worker sees one GPU only, see `flows/sampling/local.py` and `dask_cluster.py`."""
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def sampler_config(job: Job) -> SamplerConfig:
+    """The core's settings of the sampler for the run's."""
+    settings = job.config.sample
+    low, high = settings.guidance_log_snr
+    guidance = GuidanceConfig(
+        settings.guidance,
+        low_log_snr=-torch.inf if low is None else low,
+        high_log_snr=torch.inf if high is None else high,
+    )
+    return SamplerConfig(settings.solver, settings.nodes, settings.steps, guidance)

@@ -1,0 +1,51 @@
+"""Stage decode: latents of generated views -> images, fanned out over workers; may be far behind the sampling."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from flows.images import to_uint8
+from flows.jobs import Job, Outcome
+from flows.sampling.fan_out import fan_out
+from flows.sampling.groups import view_keys
+from flows.sampling.model import model_config, model_hash, shared_model
+from flows.sampling.work import Work, is_done
+from schemas.scene_store import SceneStore
+
+VERSION = 1
+
+
+def inputs(job: Job) -> dict[str, Any]:
+    """The model's weights."""
+    return {"model": model_hash(job)}
+
+
+def execute(job: Job, store: SceneStore, key: str) -> Outcome:
+    """Write `generated/image`, each view recorded in `done_image` when it is complete; only missing ones are made."""
+    generated = store.run(job.run).generated
+    views, size = generated.shape("latent")[0], model_config(job).image_size
+    generated.create_array("image", (views, size, size, 3))
+    generated.create_array("done_image", (views, 32))
+    each = [[view] for view in range(views)]
+    work = Work(job, "decode", key, generated, "done_image", "image", view_keys(key, views), [range(views)], each)
+    missing = len(work.passes[0])
+    totals = fan_out([work], job.config.execution, f"decode {job.scene_id} {job.run}")
+    return Outcome({"views": missing, "evaluations": missing} | totals.work(), totals.decisions)
+
+
+@torch.no_grad()
+def work(job: Job, store: SceneStore, key: str, items: Sequence[int]) -> None:
+    """A worker's share: decode the views `items`, one at a time."""
+    generated = store.run(job.run).generated
+    model = shared_model(job)
+    keys = view_keys(key, generated.shape("latent")[0])
+    for view in items:
+        if is_done(generated, "done_image", view, keys[view], "image"):
+            continue
+        latent = torch.from_numpy(generated.read("latent", [view])).float().to(next(model.parameters()).device)
+        image = to_uint8(model.autoencoder.decode(latent).permute(0, 2, 3, 1))
+        generated.write_views("image", image, [view])
+        generated.mark_done("done_image", [keys[view]], [view])
