@@ -31,6 +31,8 @@ FOCAL_RANGE = (0.35, 3.0)
 FOCAL_GUESSES = (0.5, 0.6, 0.75, 0.9, 1.1, 1.4, 1.8)
 # More photos than this determine their focal length by themselves.
 SWEEP_LIMIT = 12
+# From so many photos on, the best guess is refined.
+REFINABLE = 5
 
 
 @dataclass(frozen=True)
@@ -161,19 +163,28 @@ class Mapper:
         options = _options(self.seed, relaxed=True)
         options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
         options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False
-        found: list[Attempt] = []
+        found: list[tuple[Attempt, float]] = []
         for guess in FOCAL_GUESSES:
-            with pycolmap.Database.open(str(self.database)) as database:
-                for camera in database.read_all_cameras():
-                    camera.focal_length = guess * max(camera.width, camera.height)
-                    camera.has_prior_focal_length = True
-                    database.update_camera(camera)
-                database.clear_two_view_geometries()
-            self._list_pairs(image_pairs(len(self.sizes)))
-            pycolmap.verify_matches(self.database, self.pair_list, self._verification())
-            found.append(Attempt(f"relaxed, focal length {guess:g} x long side", self._map(options)))
-        most = max(a.placed for a in found)
-        return min((a for a in found if a.placed == most), key=lambda a: a.error_px)
+            self._fix_focal(guess)
+            found.append((Attempt(f"relaxed, focal length {guess:g} x long side", self._map(options)), guess))
+        most = max(attempt.placed for attempt, _ in found)
+        best, guess = min(((a, g) for a, g in found if a.placed == most), key=lambda f: f[0].error_px)
+        if len(self.sizes) < REFINABLE or most == 0:
+            return best
+        self._fix_focal(guess)
+        refined = Attempt(f"{best.name}, refined", self._map(_options(self.seed, relaxed=True)))
+        return refined if refined.placed == most and refined.error_px < best.error_px else best
+
+    def _fix_focal(self, guess: float) -> None:
+        """Take the focal length (in units of the long side) for known, and verify the matched pairs anew with it."""
+        with pycolmap.Database.open(str(self.database)) as database:
+            for camera in database.read_all_cameras():
+                camera.focal_length = guess * max(camera.width, camera.height)
+                camera.has_prior_focal_length = True
+                database.update_camera(camera)
+            database.clear_two_view_geometries()
+        self._list_pairs(image_pairs(len(self.sizes)))
+        pycolmap.verify_matches(self.database, self.pair_list, self._verification())
 
     def _map(self, options: pycolmap.IncrementalPipelineOptions) -> list[pycolmap.Reconstruction]:
         """Models found, the one with most photos first."""
