@@ -133,7 +133,7 @@ def test_killed_at_random_moments_it_ends_with_the_uninterrupted_result(finished
         _, errors = process.communicate(timeout=60)
         time.sleep(1)
         assert not servers_of(tmp_path), "a Prefect server outlived its command"
-        if kind == signal.SIGINT and process.returncode != 0:
+        if process.returncode in (130, 143):
             assert b"run the same command again" in errors
     done = subprocess.run(arguments, cwd=ROOT, env=own_server, capture_output=True, text=True, timeout=280)
     assert done.returncode == 0, done.stdout + done.stderr
