@@ -94,6 +94,18 @@ def inspect(
 
 
 @app.command()
+def models(
+    describe: Annotated[str | None, typer.Option(help="Describe a size: tiny, small, paper.")] = None,
+    model: Annotated[Path | None, typer.Option(help="Also show this model file.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
+) -> None:
+    """The diffusion models that are installed, and what the network's sizes amount to."""
+    from flows.models_command import models_command
+
+    models_command(describe, model, as_json)
+
+
+@app.command()
 def sweep(
     config: Annotated[str, typer.Argument(help="A sweep's YAML file, or the name of a shipped one (see --list).")] = "",
     out: OutOption = Path("outputs/sweep"),
@@ -141,6 +153,34 @@ def results(
     raise typer.Exit(1 if results_command(out, against, bound, bound_rest) else 0)
 
 
+@app.command()
+def stress(
+    quick: Annotated[bool, typer.Option("--quick", help="Under a minute: a few thousand cases a routine.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
+    only: Annotated[str, typer.Option(help="Only routines with this in their name, e.g. ssim or solvers.unipc.")] = "",
+    seed: Annotated[int, typer.Option(help="Another seed searches elsewhere.")] = 0,
+) -> None:
+    """Search the worst relative error of every numerical routine; exit code 1 when a bound is broken."""
+    from flows.stress_command import stress_command
+
+    stress_command(quick, as_json, only, seed)
+
+
+@app.command()
+def bench(
+    name: Annotated[str, typer.Argument(help="A benchmark, or all; without it they are listed.")] = "",
+    quick: Annotated[bool, typer.Option("--quick", help="Small sizes: all of them in minutes on two cores.")] = False,
+    data: Annotated[Path | None, typer.Option(help="Folder of real scenes, for what needs them.")] = None,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for benchmarks.md and its benchmarks/NAME.parquet.")
+    ] = Path("docs"),
+) -> None:
+    """Run time against error for every stage: tables, fronts, and where the defaults stand on them."""
+    from flows.bench_command import bench_command
+
+    raise typer.Exit(1 if bench_command(name, quick, data, out) else 0)
+
+
 def main() -> None:
     """Entry point: errors a user can act on end in one sentence and exit code 1, without a traceback."""
     # Before torch and Prefect are imported: no busy-waiting threads on shared machines, no log lines between ours.
@@ -150,9 +190,10 @@ def main() -> None:
 
     try:
         app()
-    except KeyboardInterrupt:
-        print("Interrupted. What is stored stays; run the same command again to go on.", file=sys.stderr)
-        sys.exit(130)
+    except SystemExit as stop:  # typer makes 130 of Ctrl-C, flows/server.py 143 of SIGTERM, both without a word
+        if stop.code in (130, 143):
+            print("Interrupted. What is stored stays; run the same command again to go on.", file=sys.stderr)
+        raise
     except Exception as error:
         sentence = describe(error)
         if sentence is None:
