@@ -6,9 +6,11 @@ reach the Prefect server (PREFECT_API_URL), and are started with the resources t
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import logging
 import os
+import queue
 from typing import Any
 
 import distributed
@@ -22,6 +24,11 @@ from flows.sampling.local import visible_gpus
 from flows.sampling.work import Answer, Batch, run_batch
 from schemas.config import ExecutionConfig
 from schemas.errors import ConfigError
+
+
+# Its chatter at INFO is for people who run schedulers. Workers inherit the environment.
+os.environ.setdefault("DASK_LOGGING__DISTRIBUTED", "critical")
+logging.getLogger("distributed").setLevel(logging.CRITICAL)
 
 
 @task(name="cat3d-batch", task_run_name="{label}", cache_policy=NO_CACHE, persist_result=False)
@@ -44,6 +51,7 @@ class DaskExecutor:
         if self.cluster is None:
             self.client.wait_for_workers(1, timeout=settings.timeout_s)
         self.futures: dict[int, distributed.Future] = {}
+        self.finished: queue.SimpleQueue[int] = queue.SimpleQueue()  # numbers of batches
 
     def slots(self) -> int:
         """One batch a worker, of those that have the resources; at least one, as a cluster may only be starting."""
@@ -52,18 +60,22 @@ class DaskExecutor:
         return max(1, len(able))
 
     def submit(self, batch: Batch) -> None:
-        self.futures[batch.number] = self.client.submit(
-            dask_batch, batch.model_dump_json(), f"{batch.stage} {batch.job.scene_id} {batch.number}",
-            resources=self.resources or None, pure=False,
-        )  # fmt: skip
+        label = f"{batch.stage} {batch.job.scene_id} {batch.number}"
+        future = self.client.submit(
+            dask_batch, batch.model_dump_json(), label, resources=self.resources or None, pure=False
+        )
+        self.futures[batch.number] = future
+        future.add_done_callback(lambda _: self.finished.put(batch.number))
 
     def answers(self, timeout_s: float) -> list[Answer]:
-        try:
-            distributed.wait(list(self.futures.values()), timeout=timeout_s, return_when="FIRST_COMPLETED")
-        except distributed.TimeoutError:
-            return []
-        finished = [number for number, future in self.futures.items() if future.done()]
-        return [_answer(number, self.futures.pop(number)) for number in finished]
+        out = []
+        with contextlib.suppress(queue.Empty):
+            number = self.finished.get(timeout=timeout_s)
+            while True:
+                if number in self.futures:  # else it was taken back
+                    out.append(_answer(number, self.futures.pop(number)))
+                number = self.finished.get_nowait()
+        return out
 
     def take_back(self, batch: Batch) -> None:
         future = self.futures.pop(batch.number)

@@ -40,14 +40,14 @@ class LocalExecutor:
         worker = idle[0] if idle else self._start(next(p for p in range(self.count) if p not in self.workers))
         worker.batch = batch.number
         with contextlib.suppress(BrokenPipeError):  # it has just died, which `answers` will see
-            worker.process.stdin.write(batch.model_dump_json().encode() + b"\n")
-            worker.process.stdin.flush()
+            worker.stdin.write(batch.model_dump_json().encode() + b"\n")
+            worker.stdin.flush()
 
     def answers(self, timeout_s: float) -> list[Answer]:
         out = []
         for ready, _ in self.selector.select(timeout_s):
             worker: _Worker = ready.data
-            line = worker.process.stdout.readline()
+            line = worker.stdout.readline()
             if line.endswith(b"\n"):
                 worker.batch = None
                 out.append(Answer.model_validate_json(line))
@@ -73,16 +73,16 @@ class LocalExecutor:
             environment["CUDA_VISIBLE_DEVICES"] = self.gpus[place % len(self.gpus)]
         worker = _Worker(place, self.log_folder / f"worker-{place}.log", environment)
         self.workers[place] = worker
-        self.selector.register(worker.process.stdout, selectors.EVENT_READ, worker)
+        self.selector.register(worker.stdout, selectors.EVENT_READ, worker)
         return worker
 
     def _end(self, worker: _Worker) -> int:
         """Make sure the worker is gone; its exit code. It needs no warning: the store is whole at every moment."""
-        self.selector.unregister(worker.process.stdout)
+        self.selector.unregister(worker.stdout)
         del self.workers[worker.place]
         worker.process.kill()
         code = worker.process.wait()
-        for pipe in (worker.process.stdin, worker.process.stdout):
+        for pipe in (worker.stdin, worker.stdout):
             with contextlib.suppress(OSError):
                 pipe.close()
         return code
@@ -92,8 +92,8 @@ class _Worker:
     """A process that runs `flows.sampling.worker`; `batch` is the number of the batch it has."""
 
     def __init__(self, place: int, log: Path, environment: dict[str, str]) -> None:
-        self.place, self.log, self.batch = place, log, None
-        self.batch: int | None
+        self.place, self.log = place, log
+        self.batch: int | None = None
         path = os.pathsep.join([p for p in sys.path if p])  # what this process can import, it can
         with open(log, "ab") as file:
             self.process = subprocess.Popen(
@@ -101,6 +101,8 @@ class _Worker:
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=file, env=environment | {"PYTHONPATH": path},
                 process_group=0,  # Ctrl-C is for this process, which then ends its workers
             )  # fmt: skip
+        assert self.process.stdin and self.process.stdout
+        self.stdin, self.stdout = self.process.stdin, self.process.stdout
 
 
 def visible_gpus() -> list[str]:

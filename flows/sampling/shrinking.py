@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -14,28 +13,30 @@ from flows.sampling.work import WorkerError
 
 
 def sample_at_most(
-    at_once: int, model: MultiViewModel, tensors: Sequence[Tensor], config: SamplerConfig
+    at_once: int, model: MultiViewModel, tensors: tuple[Tensor, Tensor, Tensor], config: SamplerConfig
 ) -> tuple[Tensor, int]:
     """Latents [G, N, C, h, w] of the groups, sampled `at_once` or fewer together, and how many fitted.
 
     The network always sees exactly that many groups (see SamplerConfig.micro_batch), so that one shape is one result.
     Raises WorkerError when memory doesn't hold a single group.
     """
+    device = next(model.parameters()).device
     while True:
         try:
-            return sample(model, *tensors, replace(config, micro_batch=at_once)), at_once
+            latents, raymaps, noise = (t.to(device) for t in tensors)
+            return sample(model, latents, raymaps, noise, replace(config, micro_batch=at_once)), at_once
         except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
             if not out_of_memory(error):
                 raise
             if at_once == 1:
                 raise WorkerError(
-                    f"Memory doesn't hold one group of {tensors[1].shape[1]} views on {tensors[0].device} ({error}): "
+                    f"Memory doesn't hold one group of {tensors[1].shape[1]} views on {device} ({error}): "
                     "use a smaller model, sample.precision bfloat16, or a device with more memory."
                 ) from None
             at_once //= 2
         # Outside the handler: inside, the traceback still holds the activations.
         gc.collect()
-        if tensors[0].is_cuda:
+        if device.type == "cuda":
             torch.cuda.empty_cache()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
             boxes = source_boxes(sizes, kind).tolist()
             for view in views:
                 if not done[view]:
-                    square = square_image(store.captured.read_image("image", view), *boxes[view], config.image_size)
+                    square = square_image(store.captured.read_image("image", view), boxes[view], config.image_size)
                     pixels = torch.from_numpy(square).permute(2, 0, 1)[None].float() / 255
                     latent = model.autoencoder.encode(pixels.to(next(model.parameters()).device))
                     store.latents.write_views(name, latent.half().cpu().numpy(), [view])
@@ -56,8 +57,9 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     return Outcome({"views": encoded, "evaluations": encoded})
 
 
-def square_image(image: np.ndarray, x0: int, y0: int, side: int, image_size: int) -> np.ndarray:
-    """The square (image_size, image_size, 3) uint8 at (x0, y0) with this side, in the image's pixels; grey beyond it."""
+def square_image(image: np.ndarray, box: Sequence[int], image_size: int) -> np.ndarray:
+    """(image_size, image_size, 3) uint8: the square [x0, y0, side] in pixels of the image, grey where it goes beyond."""
+    x0, y0, side = box
     height, width = image.shape[:2]
     square = np.full((side, side, 3), PADDING, np.uint8)
     left, top = max(x0, 0), max(y0, 0)

@@ -60,10 +60,9 @@ def work(job: Job, store: SceneStore, key: str, items: Sequence[int]) -> None:
     missing = {v for v in targets if not is_done(run.generated, "done_latent", v, keys[v], "latent")}
     groups = [plan.groups[g] for g in items if missing.intersection(plan.groups[g].targets)]
     at_once = job.config.execution.groups_at_once
-    where = next(model.parameters()).device
     for chunk in alike(groups, at_once):
         tensors = network_inputs(plan, chunk, latent_shape(job))
-        latents, at_once = sample_at_most(at_once, model, [t.to(where) for t in tensors], config)
+        latents, at_once = sample_at_most(at_once, model, tensors, config)
         for group, made in zip(chunk, latents.cpu(), strict=True):
             new = [i for i, view in enumerate(group.targets) if view in missing]
             views = [group.targets[i] for i in new]
@@ -88,7 +87,7 @@ def alike(groups: Sequence[Group], at_once: int) -> list[list[Group]]:
 def network_inputs(
     plan: StoredPlan, groups: Sequence[Group], shape: tuple[int, int, int]
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Conditioning latents [G, M, C, h, w], raymaps [G, M+N, 6, h, w] and noise [G, N, C, h, w] of groups of one shape."""
+    """Of groups of one shape: conditioning latents [G, M, C, h, w], raymaps [G, M+N, 6, h, w], noise [G, N, C, h, w]."""
     return (
         torch.stack([plan.condition_latents(g) for g in groups]),
         torch.stack([plan.raymaps(g, shape[-1]) for g in groups]),
