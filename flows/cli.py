@@ -172,8 +172,9 @@ def bench(
     quick: Annotated[bool, typer.Option("--quick", help="Small sizes: all of them in minutes on two cores.")] = False,
     data: Annotated[Path | None, typer.Option(help="Folder of real scenes, for what needs them.")] = None,
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for benchmarks.md and its benchmarks/NAME.parquet.")
-    ] = Path("docs"),
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for benchmarks.md and benchmarks/NAME.parquet; docs in a checkout."),
+    ] = None,
 ) -> None:
     """Run time against error for every stage: tables, fronts, and where the defaults stand on them."""
     from flows.bench_command import bench_command

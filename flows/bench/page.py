@@ -1,0 +1,147 @@
+"""The page of all benchmarks, from the Parquet tables of their last runs: Markdown and one picture of the fronts."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from flows.bench.fronts import Drawn, drawn_panels, verdict
+from flows.bench.registry import BENCHES, Row
+from schemas.errors import StoreError
+
+#: Columns that say where and when rows were measured; each benchmark has one value of them.
+RUN_COLUMNS = ("bench", "quick", "machine", "date", "load", "bench_seconds", "versions")
+MOST_ROWS = 40
+COLUMNS = 3
+
+
+def read_benches(folder: Path) -> dict[str, list[Row]]:
+    """Name -> rows, without their null columns, for each benchmark with a table there. Raises StoreError."""
+    out = {}
+    for name in BENCHES:
+        path = folder / f"{name}.parquet"
+        if not path.exists():
+            continue
+        try:
+            rows = pq.ParquetFile(path).read().to_pylist()
+        except (pa.ArrowException, OSError) as error:
+            raise StoreError(f"{path} is damaged ({error}): run `cat3d bench {name}` again.") from error
+        out[name] = [{key: value for key, value in row.items() if value is not None} for row in rows]
+    return out
+
+
+def write_page(page: Path, folder: Path) -> None:
+    """Write the Markdown `page` and the picture `folder/fronts.png` from the tables in `folder`."""
+    benches = {name: rows for name, rows in read_benches(folder).items() if rows}
+    drawn = {name: panels_of(name, rows) for name, rows in benches.items()}
+    panels = [panel for found in drawn.values() for panel in found]
+    lines = ["# Benchmarks", "", f"Written by `cat3d bench` from the tables in `{folder.name}/`; don't edit.", ""]
+    if panels:
+        _draw(panels, folder / "fronts.png")
+        lines += [
+            f"![Cost against error or quality for each stage]({folder.name}/fronts.png)", "",
+            "Lines are the fronts: what no other setting beats in both cost and value. Stars are the defaults.", "",
+        ]  # fmt: skip
+    for name, rows in benches.items():
+        run = rows[0]
+        size = ", the small sizes of `--quick`" if run["quick"] else ""
+        lines += [f"## {name}", "", f"{_sentence(BENCHES[name].summary)}", ""]
+        lines += [f"*{run['machine']}; {run['date']}; {run['load']}; {run['bench_seconds']:.0f} s{size}.*", ""]
+        lines += [f"- {panel.title}: {text}" for panel in drawn[name] for text in verdict(panel)]
+        lines += [""] if drawn[name] else []
+        shown = worth_showing(rows, drawn[name])
+        for constants, columns, body in tables(shown):
+            if constants:
+                lines += [", ".join(f"{k} {cell(v)}" for k, v in constants.items()) + ":", ""]
+            lines += ["| " + " | ".join(columns) + " |", "|---" * len(columns) + "|"]
+            lines += ["| " + " | ".join(cell(row.get(c)) for c in columns) + " |" for row in body] + [""]
+        if len(shown) < len(rows):
+            kept = f"`{folder.name}/{name}.parquet`"
+            lines += [f"Shown are the fronts and the defaults; all {len(rows)} rows are in {kept}.", ""]
+        lines += [f"<sub>{run['versions']}</sub>", ""]
+    page.write_text("\n".join(lines), encoding="utf-8")
+
+
+def panels_of(name: str, rows: list[Row]) -> list[Drawn]:
+    """Every panel of a benchmark with its rows."""
+    return [drawn for panel in BENCHES[name].panels for drawn in drawn_panels(panel, rows)]
+
+
+def worth_showing(rows: list[Row], panels: list[Drawn]) -> list[Row]:
+    """All rows if they fit on a page, else those on the fronts and the defaults."""
+    if len(rows) <= MOST_ROWS or not panels:
+        return rows
+    chosen = [row for drawn in panels for row in (*drawn.front, *drawn.defaults)]
+    return [row for row in rows if any(row is one for one in chosen)]
+
+
+def tables(rows: list[Row]) -> list[tuple[Row, list[str], list[Row]]]:
+    """(columns with one value, columns that vary, rows) for each set of columns that rows have; at least one column
+    varies, so that a single row is shown whole."""
+    groups: dict[tuple[str, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(name for name in row if name not in RUN_COLUMNS), []).append(row)
+    out = []
+    for columns, members in groups.items():
+        same = {c for c in columns if len(members) > 1 and len({str(row[c]) for row in members}) == 1}
+        varying = [c for c in columns if c not in same]
+        out.append(({c: members[0][c] for c in columns if c in same}, varying or list(columns), members))
+    return out
+
+
+def cell(value: Any) -> str:
+    """A value as a table shows it."""
+    if isinstance(value, bool):
+        return "yes" if value else ""
+    return f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
+
+
+def _sentence(text: str) -> str:
+    return text[0].upper() + text[1:] + "."
+
+
+def _draw(panels: list[Drawn], path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    lines = math.ceil(len(panels) / COLUMNS)
+    figure = Figure(figsize=(5.2 * COLUMNS, 4.2 * lines), layout="constrained")
+    axes = figure.subplots(lines, COLUMNS, squeeze=False).flatten()
+    for axis in axes[len(panels) :]:
+        axis.axis("off")
+    for axis, drawn in zip(axes, panels):
+        panel = drawn.panel
+        groups: dict[str, list[Row]] = {}
+        for row in drawn.rows:
+            groups.setdefault(" ".join(str(row.get(name)) for name in panel.series), []).append(row)
+        for number, (name, members) in enumerate(groups.items()):
+            points = [[row[column] for row in members] for column in (panel.cost, panel.value)]
+            axis.scatter(*points, s=22, color=f"C{number % 10}", marker="osv^"[number // 10 % 4], label=name, alpha=0.8)
+        front = [[row[column] for row in drawn.front] for column in (panel.cost, panel.value)]
+        axis.plot(*front, color="0.3", lw=1, zorder=1, label="front")
+        for row in drawn.defaults:
+            on_front = any(row is one for one in drawn.front)
+            axis.scatter(
+                row[panel.cost], row[panel.value], s=190, marker="*", facecolor="gold" if on_front else "white",
+                edgecolor="black", zorder=3, label="default, on the front" if on_front else "default, not on the front",
+            )  # fmt: skip
+        axis.set(title=drawn.title, xlabel=panel.cost, ylabel=panel.value)
+        _scales(axis, drawn)
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=6)
+    figure.savefig(path, dpi=100)
+
+
+def _scales(axis: Any, drawn: Drawn) -> None:
+    """Logarithmic axes, but not for decibels and not where there is nothing but zeros."""
+    for column, scale in ((drawn.panel.cost, axis.set_xscale), (drawn.panel.value, axis.set_yscale)):
+        values = [row[column] for row in drawn.rows]
+        if drawn.panel.higher_is_better and column == drawn.panel.value:
+            continue
+        if min(values) > 0:
+            scale("log")
+        elif max(values) > 0:
+            scale("symlog", linthresh=min(v for v in values if v > 0))

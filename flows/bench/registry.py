@@ -1,0 +1,204 @@
+"""Every benchmark by name: what it measures, the rows it gives, and which of its columns make a front.
+
+Rows are dictionaries; `default` says whether a row is what `cat3d` does unless told otherwise. The panels of a
+benchmark set a cost against an error or a quality: the front is worth choosing from, the rest is beaten in both.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cat3d_core.diffusion import load_model
+from cat3d_core.metrics.perceptual import find_perceptual
+from cat3d_core.weights import default_model_path
+from flows.bench import metrics, model, plan, poses, reconstruct, sampler, store, synthetic
+from flows.images import read_image
+from flows.readers import read_capture
+from flows.readers.base import InputError
+from schemas.config import PosesConfig, ReconstructConfig, SampleConfig
+
+Row = dict[str, Any]
+
+
+class MissingError(InputError):
+    """A benchmark lacks what it works on: data or a model that is not on this machine."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One plot for each combination of values in the columns `each`, over the rows with the values of `where`.
+
+    cost: column on the x axis, less is better. value: column on the y axis; `higher_is_better` for a quality.
+    series: columns that tell the colours apart. label: further columns that name a point.
+    """
+
+    title: str
+    cost: str
+    value: str
+    series: tuple[str, ...]
+    label: tuple[str, ...] = ()
+    each: tuple[str, ...] = ()
+    where: tuple[tuple[str, Any], ...] = ()
+    higher_is_better: bool = False
+
+
+@dataclass(frozen=True)
+class Bench:
+    """`run(quick, data)` measures: quick is seconds to a minute on one free core; data is a folder of real scenes or
+    None. It raises MissingError where data or a model is needed and not there."""
+
+    summary: str
+    run: Callable[[bool, Path | None], list[Row]]
+    panels: tuple[Panel, ...] = ()
+
+
+def _marked(rows: list[Row], default: Mapping[str, Any]) -> list[Row]:
+    return [row | {"default": all(row.get(name) == value for name, value in default.items())} for row in rows]
+
+
+def _devices() -> list[str]:
+    return ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+def _model_file() -> Path:
+    try:
+        return default_model_path()
+    except FileNotFoundError as error:
+        raise MissingError(str(error)) from None
+
+
+def _scenes(data: Path | None, names: list[str]) -> list[Path]:
+    """Those of the named scenes that are in the folder of real scenes."""
+    if data is None:
+        raise MissingError("This benchmark works on real scenes with known cameras: give their folder as --data DIR.")
+    found = [data / name for name in names if (data / name).is_dir()]
+    if not found:
+        raise MissingError(f"{data} holds none of the scenes {', '.join(names)}.")
+    return found
+
+
+def sampler_rows(quick: bool, data: Path | None) -> list[Row]:
+    """The closed-form mixture, and in full also the shipped model where there is one."""
+    default = SampleConfig()
+    steps = tuple(sorted({10, 20, 50, default.steps} if quick else {10, 15, 20, 30, 50, default.steps}))
+    rows = sampler.rows(None, steps, groups=16 if quick else 64)
+    if not quick:
+        with contextlib.suppress(MissingError):
+            rows += sampler.rows(_model_file(), steps)
+    chosen = {"solver": default.solver, "nodes": default.nodes, "steps": default.steps, "dtype": default.precision}
+    low, high = default.guidance_log_snr
+    return _marked(rows, chosen | ({"interval": "all"} if low is None and high is None else {}))
+
+
+def reconstruct_rows(quick: bool, data: Path | None) -> list[Row]:
+    """Presets (`paper` on a GPU only) and what changes around the default one, on procedural scenes."""
+    default = ReconstructConfig().preset
+    rows: list[Row] = []
+    for device in _devices():
+        if quick:
+            size: Row = {"train": 12, "test": 3, "size": 40, "device": device}
+            rows += reconstruct.curves("tiny", vary=(), **size)
+            rows += reconstruct.curves(default, vary=("samples", "multisamples"), iterations=200, **size)
+        else:
+            size = {"families": ("mip360", "dtu"), "device": device}
+            vary = tuple(reconstruct.VARIATIONS)
+            presets = ["tiny", "fast", "balanced", *(["paper"] if device == "cuda" else [])]
+            for preset in presets:
+                rows += reconstruct.curves(preset, vary=vary if preset == default else (), **size)
+    return _marked(rows, {"preset": default, "varied": "preset"})
+
+
+def kernel_rows(quick: bool, data: Path | None) -> list[Row]:
+    rows = []
+    for device in _devices():
+        found = reconstruct.kernels(256 if quick else 1024, repeats=2 if quick else 5, device=device)
+        rows += [{"device": device} | row for row in found]
+    return rows
+
+
+def pose_rows(quick: bool, data: Path | None) -> list[Row]:
+    default = PosesConfig().max_features
+    features = sorted({1000, default} if quick else {1000, 2000, 4000, 8000, default})
+    scenes = _scenes(data, ["strecha_fountain_P11"] if quick else list(poses.SCENES))
+    rows = [poses.measure(scene, poses.SCENES[scene.name], count) for scene in scenes for count in features]
+    return _marked(rows, {"features": default})
+
+
+def metric_rows(quick: bool, data: Path | None) -> list[Row]:
+    rows = metrics.rows(2, 252, 336, 3) if quick else metrics.rows()
+    return _marked(rows, {"implementation": "cat3d"})
+
+
+def plan_rows(quick: bool, data: Path | None) -> list[Row]:
+    return plan.coverage_rows() + plan.timing_rows(2 if quick else 5)
+
+
+def store_rows(quick: bool, data: Path | None) -> list[Row]:
+    """Procedural views, and with `data` also photos of one of its scenes."""
+    views, size, repeats = (4, 256, 3) if quick else (8, 512, 5)
+    rows = store.rows(views, size, repeats)
+    if data is not None:
+        scene = _scenes(data, list(poses.SCENES))[0]
+        paths = read_capture(scene).paths[:views]
+        photos = [read_image(path)[0] for path in paths]
+        rows += store.photo_rows(photos, scene.name, size, repeats)
+    return rows
+
+
+def model_rows(quick: bool, data: Path | None) -> list[Row]:
+    perceptual = find_perceptual()
+    return model.rows(load_model(_model_file()), 1 if quick else 20, perceptual=perceptual)
+
+
+def synthetic_rows(quick: bool, data: Path | None) -> list[Row]:
+    return synthetic.rows(64, 8, 1) if quick else synthetic.rows()
+
+
+_SAMPLER_POINT = {"series": ("solver", "nodes"), "label": ("steps", "dtype"), "each": ("interval",)}
+BENCHES: dict[str, Bench] = {
+    "sampler": Bench(
+        "solvers, noise levels, steps, guidance interval and number format against a 1,000-step float64 reference",
+        sampler_rows,
+        (
+            Panel("Sampler, closed-form mixture", "evaluations", "error", where=(("problem", "mixture"),),
+                  **_SAMPLER_POINT),  # type: ignore[arg-type]
+            Panel("Sampler, shipped model", "seconds", "error", where=(("problem", "model"),),
+                  **_SAMPLER_POINT),  # type: ignore[arg-type]
+        ),
+    ),
+    "reconstruct": Bench(
+        "held-out PSNR of the field against seconds of training: presets, samples, grid, batch",
+        reconstruct_rows,
+        (Panel("Reconstruction", "seconds", "psnr_db", ("varied",), ("preset", "setting"), ("family", "device"),
+               higher_is_better=True),),
+    ),
+    "kernels": Bench("the hash grid query beside plain torch and the memory's floor", kernel_rows),
+    "poses": Bench(
+        "camera estimation by its number of image features, against the known cameras of real scenes (needs --data)",
+        pose_rows,
+        (Panel("Poses", "seconds", "rotation_deg_median", ("features",), each=("scene",)),),
+    ),
+    "metrics": Bench(
+        "PSNR, SSIM and the perceptual distance beside other packages: seconds and rounding error",
+        metric_rows,
+        (Panel("Metric", "seconds_per_view", "error", ("implementation",), each=("metric",)),),
+    ),
+    "plan": Bench("how well anchors cover a trajectory against random choice, and how long planning takes", plan_rows),
+    "store": Bench(
+        "codecs and number formats of images and latents in the scene store: size, speed, error",
+        store_rows,
+        (
+            Panel("Store, time and size", "ms_per_view", "bytes_per_view", ("codec",), each=("content", "source"),
+                  where=(("store_format", True),)),
+            Panel("Store, size and error", "bytes_per_view", "error", ("format",), ("codec",), ("content", "source")),
+        ),
+    ),
+    "model": Bench("samples of the shipped model on held-out scenes, beside baselines and ceiling", model_rows),
+    "synthetic": Bench("procedural scenes rendered: views a second per family", synthetic_rows),
+}  # fmt: skip
