@@ -63,8 +63,10 @@ class Autoencoder(nn.Module):
 
     def posterior(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log-variance of the raw latents, each [B, C, H/8, W/8]."""
-        if images.shape[1] != 3 or images.shape[-1] % 8 or images.shape[-2] % 8:
-            raise ValueError(f"Images are [B, 3, H, W] with sides that are multiples of 8, not {tuple(images.shape)}.")
+        if not images.numel() or images.shape[1] != 3 or images.shape[-1] % 8 or images.shape[-2] % 8:
+            raise ValueError(
+                f"Images are [B, 3, H, W], at least one, with sides that are multiples of 8, not {tuple(images.shape)}."
+            )
         dtype = self.latent_mean.dtype
         mean, log_variance = self.encoder((images * 2 - 1).to(dtype)).chunk(2, 1)
         return mean, log_variance.clamp(-30, 20)
