@@ -13,8 +13,8 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
+from flows.colmap import pycolmap
 from flows.images import exif_focal_px, read_image, read_mask, resize, write_png
 
 Progress = Callable[[str, int, int], None]

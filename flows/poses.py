@@ -14,11 +14,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import torch
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
+from flows.colmap import pycolmap
 from flows.images import exif_focal_px, read_image
 from flows.mapping import FROM_EXIF, Attempt, Mapper, PoseSettings, Progress, image_index
 from flows.readers.base import InputError

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import multiprocessing
 import os
 import shutil
 import signal
@@ -117,6 +118,8 @@ def _die_with_parent() -> None:
 
 def _sigterm_exits():
     def leave(_signum, _frame):
+        for child in multiprocessing.active_children():  # a pool would wait for their work before it lets us go
+            child.terminate()
         raise SystemExit(143)
 
     try:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import os
 import string
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
-from prefect.task_runners import ProcessPoolTaskRunner, ThreadPoolTaskRunner
+from prefect.task_runners import ProcessPoolTaskRunner
 
 from flows.errors import describe
 from flows.jobs import Job, capture_digests, expected_steps, make_jobs, pending
@@ -80,12 +82,19 @@ def run_scene(scene_id: str, jobs: list[dict[str, Any]]) -> dict[str, str]:
 
 
 @flow(name="cat3d-sweep", validate_parameters=False)
-def _sweep(scenes: list[list[dict[str, Any]]]) -> list[str]:
-    futures = [(jobs[0]["scene_id"], run_scene.submit(jobs[0]["scene_id"], jobs)) for jobs in scenes]
+def _sweep(scenes: list[list[dict[str, Any]]], workers: int) -> list[str]:
+    """One task a scene. With one worker in this very thread, so that Ctrl-C and SIGTERM stop it at once."""
+    calls: list[tuple[str, Callable[[], dict[str, str]]]] = []
+    for jobs in scenes:
+        scene_id = jobs[0]["scene_id"]
+        if workers > 1:
+            calls.append((scene_id, run_scene.submit(scene_id, jobs).result))
+        else:
+            calls.append((scene_id, partial(run_scene, scene_id, jobs)))
     problems: list[str] = []
-    for scene_id, future in futures:
+    for scene_id, call in calls:
         try:
-            problems += future.result().values()
+            problems += call().values()
         except Exception as error:
             problems.append(f"{scene_id}: failed with {type(error).__name__}: {error}")
     return problems
@@ -104,10 +113,10 @@ def run_sweep(config: SweepConfig, out: Path) -> list[str]:
     out.mkdir(parents=True, exist_ok=True)
     (out / "sweep.json").write_text(json.dumps(config.model_dump(mode="json"), indent=1))
     if todo:
-        runner: Any = ProcessPoolTaskRunner(config.workers) if config.workers > 1 else ThreadPoolTaskRunner(1)
+        runner: Any = ProcessPoolTaskRunner(config.workers)
         with prefect_server(out / ".prefect"):
             documents = [[job.model_dump(mode="json") for job in jobs] for jobs in todo]
-            problems += _sweep.with_options(task_runner=runner)(documents)
+            problems += _sweep.with_options(task_runner=runner)(documents, config.workers)
     page = write_report(out, only_if_changed=not todo)
     console.print(f"Report: {page}")
     return problems

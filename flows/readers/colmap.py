@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import torch
 from torch import Tensor
 
+from flows.colmap import pycolmap
 from flows.readers import splits
 from flows.readers.base import Capture, InputError, inside
 from flows.readers.parsing import cameras_for_files, family_of, from_camera_from_world, pinhole, unlisted_note

@@ -60,3 +60,15 @@ def test_the_users_server_is_used_and_a_missing_one_is_named(tmp_path: Path, mon
         with prefect_server(tmp_path):
             pass
     assert not (tmp_path / "prefect.db").exists()
+
+
+def test_sigterm_reaches_our_handler_after_pycolmap_is_loaded() -> None:
+    code = (
+        "import os, signal, sys\n"
+        "signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))\n"
+        "import flows.poses\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 7
+    assert "stack trace" not in done.stderr
