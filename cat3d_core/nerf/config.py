@@ -137,6 +137,9 @@ _FAST = replace(
     chunk_rays=1024,
     patch_size=24,  # LPIPS networks need 16 to 31 pixels; ST-LPIPS AlexNet, the default here, 21
     patch_share=0.5,
+    # One small patch a step makes the LPIPS gradient so noisy that the paper's weight drowns the photometric loss:
+    # llff_fern, 3 views, 101x76, 300 iterations: 24.7 dB without, 23.4 at 0.02, 18.9 at 0.25.
+    lpips_weight=0.02,
     samples=(32, 16),
     grid_max=(128, 1024),
     grid_features=(1, 4),
@@ -154,7 +157,7 @@ PRESETS: dict[str, ReconstructConfig] = {
     "fast": _FAST,
     "balanced": replace(
         _FAST, iterations=2500, warmup_iterations=250, batch_rays=4096, chunk_rays=4096, patch_size=32,
-        samples=(48, 48, 24), grid_max=(256, 512, 2048), grid_features=(1, 1, 4), interlevel_blur=(0.03, 0.003),
+        lpips_weight=0.1, samples=(48, 48, 24), grid_max=(256, 512, 2048), grid_features=(1, 1, 4), interlevel_blur=(0.03, 0.003),
         grid_log2_table=18, density_width=64,
     ),
     "paper": _PAPER,

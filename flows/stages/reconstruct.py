@@ -25,11 +25,15 @@ from schemas.scene_store import Run, SceneStore
 VERSION = 1
 CHECKPOINT_INTERVAL_S = 20.0
 #: CAT3D: LPIPS weight 1 on CO3D and mip-NeRF 360, 0.25 elsewhere.
+STRONG_LPIPS = 4.0
 STRONG_LPIPS_DATASETS = ("co3d", "mip360", "mipnerf360")
 
 
 def trainer_config(job: Job) -> ReconstructConfig:
-    """The preset with the method's and family's LPIPS weight and the run's overrides. Raises ConfigError naming a bad setting."""
+    """The preset with the method's and family's LPIPS weight and the run's overrides.
+
+    Raises ConfigError naming a bad setting.
+    """
     settings = job.config.reconstruct
     config = PRESETS[settings.preset]
     if job.config.method == "zipnerf":
@@ -37,7 +41,7 @@ def trainer_config(job: Job) -> ReconstructConfig:
         # views, 101x76, 300 iterations of `fast`: 24.7 dB without, 18.9 dB with.)
         config = dataclasses.replace(config, lpips_weight=0.0)
     elif job.dataset in STRONG_LPIPS_DATASETS:
-        config = dataclasses.replace(config, lpips_weight=1.0)
+        config = dataclasses.replace(config, lpips_weight=STRONG_LPIPS * config.lpips_weight)
     known = {f.name for f in dataclasses.fields(ReconstructConfig)}
     unknown = sorted(set(settings.overrides) - known)
     if unknown:
