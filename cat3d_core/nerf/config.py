@@ -157,7 +157,8 @@ PRESETS: dict[str, ReconstructConfig] = {
     "fast": _FAST,
     "balanced": replace(
         _FAST, iterations=2500, warmup_iterations=250, batch_rays=4096, chunk_rays=4096, patch_size=32,
-        lpips_weight=0.1, samples=(48, 48, 24), grid_max=(256, 512, 2048), grid_features=(1, 1, 4), interlevel_blur=(0.03, 0.003),
+        lpips_weight=0.1, samples=(48, 48, 24), grid_max=(256, 512, 2048), grid_features=(1, 1, 4),
+        interlevel_blur=(0.03, 0.003),
         grid_log2_table=18, density_width=64,
     ),
     "paper": _PAPER,
