@@ -56,6 +56,11 @@ class Schedule:
         if steps < 3:
             raise ValueError(f"Sampling needs at least 3 steps, not {steps}.")
         table, count = self.log_snr, self.config.steps
+        if steps > count and kind in ("trailing", "linspace"):
+            raise ValueError(
+                f"{kind!r} nodes are entries of a table of {count} steps, so there can't be {steps} different ones; use "
+                "'log_snr' or 'karras' nodes."
+            )
         if kind == "trailing":
             index = torch.arange(steps, dtype=torch.float64) * (-count / steps) + count
             return table[index.round().long() - 1]

@@ -127,7 +127,7 @@ class Trainer:
         """One batch: latents [G, V, C, h, w], raymaps [G, V, 6, h, w], any float dtype, conditioning views first.
 
         Returns numbers to log: step, loss, lr, grad_norm (nan unless this call ended an accumulation). Raises
-        FloatingPointError if the loss is not finite; the weights are then those of the last good step.
+        FloatingPointError if the loss or the gradient is not finite; the weights are then those of the last good step.
         """
         rank, world = _rank_and_world()
         schedule = Schedule(self.model_config.schedule, latents.shape[1] - n_condition)
@@ -157,6 +157,10 @@ class Trainer:
             for gradient, part in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
                 gradient.copy_(part.view_as(gradient))
         norm = nn.utils.clip_grad_norm_(self.masters, self.config.clip_norm)
+        if not bool(norm.isfinite()):  # clipping by it would make every weight NaN
+            for gradient in gradients:
+                gradient.zero_()
+            raise FloatingPointError(f"The gradient's norm is {norm:g} at step {self.steps}; lower the learning rate.")
         for group in self.optimizer.param_groups:
             group["lr"] = self.config.learning_rate_at(self.steps - 1)
         self.optimizer.step()

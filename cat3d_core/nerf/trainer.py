@@ -184,7 +184,8 @@ class Trainer:
         self.best_error = min(error, self.best_error)
 
     def _finite(self, totals: dict[str, Tensor]) -> bool:
-        gradients = [p.grad.abs().max() for p in self.adam.parameters.values() if p.grad is not None]
+        # Squared, as Adam will: a gradient beyond 1e19 would freeze its parameter with an infinite second moment.
+        gradients = [p.grad.abs().max().square() for p in self.adam.parameters.values() if p.grad is not None]
         return bool(torch.isfinite(torch.stack([*totals.values(), *gradients])).all())
 
     @torch.no_grad()
