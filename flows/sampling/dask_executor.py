@@ -25,7 +25,6 @@ from flows.sampling.work import Answer, Batch, run_batch
 from schemas.config import ExecutionConfig
 from schemas.errors import ConfigError
 
-
 # Its chatter at INFO is for people who run schedulers. Workers inherit the environment.
 os.environ.setdefault("DASK_LOGGING__DISTRIBUTED", "critical")
 logging.getLogger("distributed").setLevel(logging.CRITICAL)

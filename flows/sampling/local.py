@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import BinaryIO, cast
 
 import torch
 
@@ -101,8 +102,7 @@ class _Worker:
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=file, env=environment | {"PYTHONPATH": path},
                 process_group=0,  # Ctrl-C is for this process, which then ends its workers
             )  # fmt: skip
-        assert self.process.stdin and self.process.stdout
-        self.stdin, self.stdout = self.process.stdin, self.process.stdout
+        self.stdin, self.stdout = cast(BinaryIO, self.process.stdin), cast(BinaryIO, self.process.stdout)
 
 
 def visible_gpus() -> list[str]:

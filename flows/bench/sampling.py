@@ -1,0 +1,136 @@
+"""Benchmark of the fan-out: speed-up and overhead of worker processes and of a Dask cluster, costs of the parts.
+
+`python -m flows.bench.sampling WORK [--model FILE] [--groups 24]` prints what `docs/scaling.md` calculates with.
+  share    wall time, workers' busy seconds, overhead = workers * wall / busy - 1, of sampling real groups, by executor
+  batch    seconds a batch costs apart from its groups: handed groups that are done already, a worker only looks
+  store    operations per second on the store: latents written, marks written, marks read
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flows.jobs import Job, expected_steps, make_jobs, pending
+from flows.run_command import make_config
+from flows.sampling.executors import open_executor
+from flows.sampling.fan_out import fan_out
+from flows.sampling.work import Batch, is_done
+from flows.scene import ensure_store, execute_stage, prepare_run
+from flows.server import prefect_server
+from flows.stages.sample import sample_work
+from schemas.scene_store import SceneStore
+
+SOURCE = "procedural:dtu/3?views=9&width=64&height=64"
+
+
+def prepared(work: Path, model: Path | None, groups: int) -> Job:
+    """A job whose store is ready to be sampled: 5 views a group."""
+    settings = [f"plan.views={5 * groups}", "method=cat3d", *([f"sample.checkpoint={model}"] if model else [])]
+    job = make_jobs(SOURCE, work, ["3"], make_config({}, None, settings))[1][0]
+    capture = job.capture()
+    ensure_store(job, capture)
+    prepare_run(job, capture)
+    for step in pending(job, expected_steps(job, capture)):
+        if step.stage in ("ingest", "poses", "plan", "encode"):
+            execute_stage(job, step)
+    return job
+
+
+def with_execution(job: Job, **execution: Any) -> Job:
+    """The same job, worked on in another way."""
+    settings = job.config.execution.model_copy(update=execution)
+    return job.model_copy(update={"config": job.config.model_copy(update={"execution": settings})})
+
+
+def share_row(job: Job, executor: str, workers: int) -> dict[str, Any]:
+    """Sample everything anew."""
+    job = with_execution(job, executor=executor, workers=workers)
+    store = SceneStore.open(job.store_path, "r+")
+    for name in ("latent", "done_latent"):
+        store.run(job.run).generated.remove(name)
+    work = sample_work(job, store, "0" * 64)
+    started = time.monotonic()
+    totals = fan_out([work], job.config.execution, f"{executor} {workers}")
+    wall = time.monotonic() - started
+    return {
+        "what": "share", "executor": executor, "workers": workers, "groups": len(work.views), "wall_s": wall,
+        "busy_s": totals.busy_seconds, "loading_s": totals.loading_seconds, "batches": totals.batches,
+        "overhead": workers * wall / totals.busy_seconds - 1,
+    }  # fmt: skip
+
+
+def batch_row(job: Job, executor: str, count: int = 40) -> dict[str, Any]:
+    """Hand out batches of one group that is done already, one after another; the store must be sampled."""
+    job = with_execution(job, executor=executor, workers=1)
+    started = time.monotonic()
+    open_one = open_executor(job.config.execution, job.out / ".work")
+    try:
+        times = []
+        for number in range(count):
+            sent = time.monotonic()
+            open_one.submit(Batch(number=number, job=job, stage="sample", key="0" * 64, items=(0,)))
+            while not (answers := open_one.answers(60)):
+                pass
+            answers[0].raise_error()
+            times.append(time.monotonic() - sent)
+            if number == 0:
+                start_up = time.monotonic() - started
+    finally:
+        open_one.close()
+    rest = np.array(times[1:])
+    return {
+        "what": "batch", "executor": executor, "first_s": start_up, "median_s": float(np.median(rest)),
+        "p90_s": float(np.quantile(rest, 0.9)), "in_worker_s": answers[0].seconds,
+    }  # fmt: skip
+
+
+def store_rows(job: Job, folder: Path, views: int = 400) -> Iterator[dict[str, Any]]:
+    """The operations a group needs, at paper size (64 x 64 x 8 latents), one after another in one process."""
+    store = SceneStore.create(folder / "bench.zarr", "bench", "bench", {})
+    generated = store.run("r", create=True).generated
+    generated.create_array("latent", (views, 8, 64, 64))
+    generated.create_array("done_latent", (views, 32))
+    latent = np.random.default_rng(0).normal(size=(1, 8, 64, 64)).astype(np.float16)
+    operations = {
+        "latent written": lambda v: generated.write_views("latent", latent, [v]),
+        "mark written": lambda v: generated.mark_done("done_latent", ["0" * 64], [v]),
+        "mark read": lambda v: is_done(generated, "done_latent", v, "0" * 64),
+        "latent read": lambda v: generated.read("latent", [v]),
+    }
+    for name, operation in operations.items():
+        started = time.monotonic()
+        for view in range(views):
+            operation(view)
+        seconds = time.monotonic() - started
+        yield {"what": "store", "operation": name, "per_second": views / seconds, "ms": 1000 * seconds / views}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--model", type=Path)
+    parser.add_argument("--groups", type=int, default=24)
+    parser.add_argument("--executors", default="local:1,local:2,dask:2")
+    arguments = parser.parse_args()
+    work = arguments.work.resolve()
+    shutil.rmtree(work / "bench.zarr", ignore_errors=True)
+    with prefect_server(work / ".prefect"):
+        job = prepared(work, arguments.model and arguments.model.resolve(), arguments.groups)
+        for row in store_rows(job, work):
+            print(row, flush=True)
+        for text in arguments.executors.split(","):
+            executor, workers = text.split(":")
+            print(share_row(job, executor, int(workers)), flush=True)
+        for executor in sorted({text.split(":")[0] for text in arguments.executors.split(",")}):
+            print(batch_row(job, executor), flush=True)
+
+
+if __name__ == "__main__":
+    main()
