@@ -302,7 +302,8 @@ def save_training(work: Path, trainer: Trainer, clock: dict) -> None:
 
 
 def export(work: Path, scenes: int) -> None:
-    """Ship the averaged weights in float16, evaluate them on held-out scenes, put the numbers on the model card."""
+    """Ship the averaged weights in float16, evaluate them on `scenes` held-out scenes a family (0: don't), and put the
+    numbers on the model card."""
     from cat3d_core.weights import default_model_path
     from flows.bench.model import evaluate_file
 
@@ -311,7 +312,8 @@ def export(work: Path, scenes: int) -> None:
     root = Path(__file__).resolve().parents[1]
     target = root / "cat3d_core" / "weights" / "default.safetensors"
     digest = save_model(target, load_model(work / "model.safetensors"), source, torch.float16)
-    tables = evaluate_file(default_model_path(), scenes, pictures=work / "pictures")
+    target.chmod(0o644)
+    tables = evaluate_file(default_model_path(), scenes, pictures=work / "pictures") if scenes else "Not evaluated yet."
     card = root / "docs" / "model_card.md"
     head, _, rest = card.read_text().partition(START)
     facts = (
