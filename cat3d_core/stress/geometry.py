@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
+from cat3d_core.coverage import bin_of
 from cat3d_core.diffusion.conditioning import camera_vectors, relative_raymaps
 from cat3d_core.rays import pixel_rays, raymap
 from cat3d_core.stress.draw import Draw
-from cat3d_core.stress.routine import ROUNDING, Call, Exact, Reference, Routine, each
+from cat3d_core.stress.routine import ROUNDING, Call, Exact, Reference, Routine, each, zero
 
 _SIZE = 64  # pixels a side of the cameras drawn here
 
@@ -61,6 +62,54 @@ def _project_reference(k: Tensor, pose: Tensor, point: Tensor) -> Exact:
     meant = depth > 1e-5 * reach
     scale = torch.stack([*torch.where(meant, spread, torch.inf), reach], -1)
     return Exact(torch.cat([torch.where(meant[:, None], pixels, 0.0), depth[:, None]], -1), scale)
+
+
+def _inverse(pose: Tensor) -> Tensor:
+    return cameras_of(torch.eye(3, dtype=pose.dtype).expand(len(pose), 3, 3), pose).camera_from_world
+
+
+def _inverse_reference(pose: Tensor) -> Exact:
+    """A general inverse; rounding leaves a pose rigid to eps only, which moves the centre by as much of itself."""
+    scale = torch.ones_like(pose)
+    scale[:, :3, 3] = length(pose[:, :3, 3])[:, None]
+    return Exact(torch.linalg.inv(pose), scale)
+
+
+def _window_inputs(draw: Draw) -> tuple[Tensor, ...]:
+    """Camera, image point, window (left, top, width, height) and its size after resampling, whole numbers."""
+    window = torch.cat([draw.between(2, -5000, 5000), draw.between(2, 1, 5000)], 1).round().long()
+    return _intrinsics(draw), draw.between(2, -10, _SIZE + 10), window, draw.between(2, 1, 5000).round().long()
+
+
+def _window(k: Tensor, xy: Tensor, window: Tensor, size: Tensor) -> Tensor:
+    """Direction of the same ray by way of the cropped, padded and resampled camera."""
+    left, top, width, height = window.tolist()
+    camera = cameras_of(k[None], torch.eye(4, dtype=k.dtype)[None]).crop(left, top, width, height)
+    camera = camera.pad(3, 4, 5, 6).resize(*size.tolist())
+    factor = size.to(k) / torch.tensor([width + 8, height + 10]).to(k)
+    moved = (xy - window[:2].to(k) + torch.tensor([3.0, 4.0]).to(k)) * factor
+    return pixel_rays(camera, torch.zeros(1, dtype=torch.long), moved[None]).directions[0]
+
+
+def _window_reference(k: Tensor, xy: Tensor, window: Tensor, size: Tensor) -> Exact:
+    v = (xy[:, 1] - k[:, 1, 2]) / k[:, 1, 1]
+    u = (xy[:, 0] - k[:, 0, 2] - k[:, 0, 1] * v) / k[:, 0, 0]
+    away = (xy.abs() + k[:, :2, 2].abs() + window[:, :2].abs() + 10).sum(-1)
+    skew = 1 + (k[:, 0, 1] / k[:, 0, 0]).abs()
+    reach = 1 + skew * away * (1 / k[:, 0, 0] + 1 / k[:, 1, 1])
+    return Exact(torch.stack([u, v, torch.ones_like(u)], -1), reach[:, None])
+
+
+def _bins(directions: Tensor) -> Tensor:
+    """How far a direction lies outside the band of height and the sector of azimuth that it was sorted into."""
+    number = bin_of(directions)
+    wide = directions.double()
+    height, turn = wide[:, 2] / length(wide), torch.atan2(wide[:, 1], wide[:, 0]) / torch.pi
+    outside = torch.zeros_like(height)
+    for value, index, count in ((height, number // 16, 8), (turn, number % 16, 16)):
+        low = 2 * index / count - 1
+        outside = torch.maximum(outside, torch.maximum(low - value, value - low - 2 / count))
+    return outside.to(directions.dtype)
 
 
 def _ray_inputs(draw: Draw) -> tuple[Tensor, ...]:
@@ -180,6 +229,19 @@ ROUTINES = [
     Routine(
         "cameras.project", "pixels and depth; finite behind and at the camera",
         _project_inputs, _project, _project_reference, ROUNDING, chunk=128, share=0.5,
+    ),
+    Routine(
+        "cameras.camera_from_world", "inverse of rigid poses",
+        lambda draw: (pose_of(draw.rotation()[:, 0], draw.signed(3)),), _inverse, _inverse_reference,
+        {torch.float64: 1e-14, torch.float32: 2e-6},
+    ),
+    Routine(
+        "cameras.crop", "crop, pad and resize leave every ray where it was", _window_inputs, each(_window),
+        _window_reference, ROUNDING, share=0.1,
+    ),
+    Routine(
+        "coverage.bin_of", "the bin of a direction of any length",
+        lambda draw: (draw.direction()[:, 0] * draw.log_between(1, 1e-12, 1e12),), _bins, zero, ROUNDING,
     ),
     Routine(
         "rays.pixel_rays", "directions and cone radii for any lens", _ray_inputs, _rays, _rays_reference,

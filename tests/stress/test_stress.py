@@ -11,6 +11,8 @@ import pytest
 import torch
 import typer
 
+from cat3d_core.diffusion import ScheduleConfig
+from cat3d_core.diffusion.schedule import Schedule
 from cat3d_core.stress import ROUTINES, Routine, stress
 from cat3d_core.stress.draw import Draw
 from cat3d_core.stress.routine import Exact
@@ -118,6 +120,37 @@ def test_references_of_one_number() -> None:
         lambda x: (1 / (1 + mpmath.exp(-mpmath.mpf(x)))) ** half if math.isfinite(x) else None,
         column=0,
     )
+
+
+@pytest.mark.parametrize("base", ["cosine", "scaled_linear", "linear"])
+@pytest.mark.parametrize("terminal", [True, False])
+def test_schedule_tables(base: str, terminal: bool) -> None:
+    """The definitions of the tables in 60 digits, the shift by the logarithm of the number of targets included."""
+    config = ScheduleConfig(base=base, zero_terminal_snr=terminal)  # type: ignore[arg-type]
+    with mpmath.workdps(60):
+        count = config.steps
+        first, last = mpmath.mpf(config.beta_start), mpmath.mpf(config.beta_end)
+        line = [mpmath.mpf(i) / (count - 1) for i in range(count)]
+        if base == "cosine":
+            offset, whole = mpmath.mpf("0.008"), mpmath.mpf("1.008")
+            curve = [
+                mpmath.cos((mpmath.mpf(i) / count + offset) / whole * mpmath.pi / 2) ** 2 for i in range(count + 1)
+            ]
+            betas = [min(1 - curve[i + 1] / curve[i], mpmath.mpf("0.999")) for i in range(count)]
+        elif base == "scaled_linear":
+            betas = [(mpmath.sqrt(first) + x * (mpmath.sqrt(last) - mpmath.sqrt(first))) ** 2 for x in line]
+        else:
+            betas = [first + x * (last - first) for x in line]
+        signal, product = [], mpmath.mpf(1)
+        for beta in betas:
+            product *= 1 - beta
+            signal.append(mpmath.sqrt(product))
+        if terminal:
+            scale = signal[0] / (signal[0] - signal[-1])
+            signal = [(x - signal[-1]) * scale for x in signal]
+        exact = [float(mpmath.log(x**2 / (1 - x**2)) - mpmath.log(7)) if x else -math.inf for x in signal]
+    got = Schedule(config, 7).log_snr
+    torch.testing.assert_close(got, torch.tensor(exact, dtype=torch.float64), rtol=1e-11, atol=1e-11)
 
 
 def _against_mpmath(name: str, exact: object, tolerance: float = 1e-12, column: int | None = None) -> None:
