@@ -177,7 +177,9 @@ def test_thirty_kills_of_workers_and_parents_at_random_moments(scene, expected) 
     seen: dict[int, tuple[int, int]] = {}
     process = start(job)
     while sum(kills.values()) < 30:
-        time.sleep(rng.uniform(0.5, 8))
+        if rng.random() < 0.8:  # else while it starts
+            wait_for(lambda p=process: workers_of(p.pid) or p.poll() is not None)
+        time.sleep(rng.uniform(0, 4))
         if process.poll() is not None:  # it finished in between: take some of the result away again
             folder = run_of(job).generated.folder
             for view in rng.sample(range(24), 12):
