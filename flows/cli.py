@@ -94,6 +94,36 @@ def inspect(
 
 
 @app.command()
+def export(
+    store: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder) with a finished run.")],
+    run_name: Annotated[str | None, typer.Option("--run", help="The run, where the store has several.")] = None,
+    what: Annotated[
+        str, typer.Option(help="mesh, points, dataset, renders; several by commas. All but renders if not given.")
+    ] = "",
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the exports.")] = Path("exports"),
+    frame: Annotated[
+        str, typer.Option(help="Coordinates: world is the data set's own; scene is normalised, +z up.")
+    ] = "world",
+    resolution: Annotated[int, typer.Option(help="Voxels along each side of the mesh's cube.")] = 512,
+    radius: Annotated[
+        float, typer.Option(help="What counts as surface, in mean distances from the cameras to what they look at.")
+    ] = 3.0,
+    opacity: Annotated[float, typer.Option(help="Least opacity of a pixel that counts as surface.")] = 0.5,
+    views: Annotated[int, typer.Option(help="Cameras to render for mesh and points, at most.")] = 120,
+    scale: Annotated[float, typer.Option(help="Their size relative to the photos.")] = 1.0,
+    path: Annotated[
+        Path | None,
+        typer.Option(help='Renders along it: JSON list of {"world_from_camera": 4x4, "fov": degrees}, in --frame.'),
+    ] = None,
+) -> None:
+    """A finished run as a mesh (PLY, GLB), points, a nerfstudio and COLMAP data set, or renders along any path."""
+    from flows.export_command import SurfaceSettings, export_command
+
+    settings = SurfaceSettings(resolution, radius, opacity, views, scale)
+    export_command(store, run_name, what, out, frame, settings, path)
+
+
+@app.command()
 def models(
     describe: Annotated[str | None, typer.Option(help="Describe a size: tiny, small, paper.")] = None,
     model: Annotated[Path | None, typer.Option(help="Also show this model file.")] = None,

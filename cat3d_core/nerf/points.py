@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -21,16 +22,29 @@ class PointCloud(NamedTuple):
     normals: Tensor
 
 
-def surface_mask(
-    render: Render, rays_directions: Tensor, min_opacity: float, max_depth: float, min_cosine: float
+def surface_depth(
+    render: Render,
+    cameras: Cameras,
+    index: int,
+    min_opacity: float = 0.5,
+    max_depth: float = 10.0,
+    min_cosine: float = 0.1,
+    max_radius: float = math.inf,
 ) -> Tensor:
-    """Pixels (H, W) whose median depth is a surface: opaque enough, near enough, and not seen at a grazing angle.
+    """Median z-depth (H, W) of camera `index` where the pixel shows a surface, 0 elsewhere.
 
-    Depth edges are grazing too: the normals come from depth differences (directions (H * W, 3), any length).
+    A surface is opaque enough, near enough to the camera (max_depth) and to the scene's origin (max_radius), and not
+    seen at a grazing angle. What lies between two depths at an edge is grazing too: normals come from depth
+    differences. The render may be coarser or finer than the camera's image.
     """
-    view = torch.nn.functional.normalize(rays_directions, dim=-1).view(*render.depth.shape, 3)
-    cosine = -(render.normals * view).sum(-1)
-    return (render.opacity >= min_opacity) & (render.depth <= max_depth) & (cosine >= min_cosine)
+    height, width = render.depth.shape
+    rays = image_rays(cameras, index, width, height)
+    directions = rays.directions.to(render.depth)
+    points = rays.origins.to(render.depth) + render.depth.reshape(-1, 1) * directions
+    cosine = -(render.normals.view(-1, 3) * torch.nn.functional.normalize(directions, dim=-1)).sum(-1)
+    near = (render.depth <= max_depth) & (points.norm(dim=-1) <= max_radius).view(height, width)
+    surface = near & (render.opacity >= min_opacity) & (cosine >= min_cosine).view(height, width)
+    return torch.where(surface, render.depth, 0.0)
 
 
 def point_cloud(
@@ -39,8 +53,9 @@ def point_cloud(
     min_opacity: float = 0.5,
     max_depth: float = 10.0,
     min_cosine: float = 0.1,
+    max_radius: float = math.inf,
 ) -> PointCloud:
-    """One coloured point per surface pixel of the renders, which may be coarser than the cameras' images.
+    """One coloured point per surface pixel of the renders (see `surface_depth`).
 
     Depths and the result are in normalised scene units (map back with the scene's inverse similarity).
     Raises ValueError where the number of renders and cameras differ.
@@ -53,9 +68,9 @@ def point_cloud(
     for index, render in enumerate(renders):
         height, width = render.depth.shape
         rays = image_rays(cameras, index, width, height)
-        origins, directions = rays.origins.to(render.depth), rays.directions.to(render.depth)
-        keep = surface_mask(render, directions, min_opacity, max_depth, min_cosine).reshape(-1)
-        points = origins + render.depth.reshape(-1, 1) * directions
+        depth = surface_depth(render, cameras, index, min_opacity, max_depth, min_cosine, max_radius).reshape(-1, 1)
+        keep = depth[:, 0] > 0
+        points = rays.origins.to(depth) + depth * rays.directions.to(depth)
         for part, value in zip(parts, (points, render.image.view(-1, 3), render.normals.view(-1, 3)), strict=True):
             part.append(value[keep])
     return PointCloud(*(torch.cat(part) for part in parts))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -168,3 +168,17 @@ def render_image(
         opacity=opacity.view(height, width).clamp(0.0, 1.0),
         normals=normals_from_depth(depth, rays),
     )
+
+
+def render_ladder(
+    field: Field,
+    cameras: Cameras,
+    view_index: int,
+    config: ReconstructConfig | None = None,
+    scales: Sequence[float] = (1 / 8, 1 / 4, 1 / 2, 1),
+    on_progress: Callable[[float], None] | None = None,
+) -> Iterator[Render]:
+    """The view at rising resolution, each as soon as it is done, for interactive use: stop iterating, or raise in
+    `on_progress` (share of the present rung, see `render_image`), once the camera has moved on."""
+    for scale in scales:
+        yield render_image(field, cameras, view_index, config, scale, on_progress=on_progress)

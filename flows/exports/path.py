@@ -1,0 +1,74 @@
+"""Renders along any camera path: a JSON file of poses -> PNG images and an mp4 video."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cat3d_core.cameras import Cameras
+from flows.exports.source import Source, render_views
+from flows.images import read_image, write_png, write_video
+from flows.pictures import depth_picture
+from flows.readers.base import InputError
+from flows.readers.parsing import load_json, numbers
+
+LARGEST_SIDE = 8192
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """cameras (N), all of one size, in the frame of the file; frames per second of the video."""
+
+    cameras: Cameras
+    fps: float
+
+
+def read_path(path: Path, width: int, height: int) -> CameraPath:
+    """Read a camera path: a list of {"world_from_camera": 4x4 (OpenCV axes), "fov": vertical, degrees}, or an object
+    with that list as "frames" and optionally "width", "height" (pixels; default: as given) and "fps".
+
+    Raises InputError naming the frame that cannot be used.
+    """
+    document = load_json(path)
+    header: dict[str, Any] = document if isinstance(document, dict) else {"frames": document}
+    frames = header.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f'{path} holds no list of frames; write [{{"world_from_camera": 4x4, "fov": degrees}}, ...].')
+    sizes = [header.get("width", width), header.get("height", height)]
+    if not all(isinstance(side, int) and 1 <= side <= LARGEST_SIDE for side in sizes):
+        raise InputError(f"{path}: width and height must be whole numbers from 1 to {LARGEST_SIDE}; got {sizes}.")
+    fps = header.get("fps", 30)
+    if not isinstance(fps, (int, float)) or not 0 < fps <= 1000:
+        raise InputError(f"{path}: fps is {fps!r}; expected a number above 0.")
+    poses, intrinsics = [], []
+    for i, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not {"world_from_camera", "fov"} <= frame.keys():
+            raise InputError(f'{path}: frame {i} needs "world_from_camera" (4x4) and "fov" (vertical, degrees).')
+        fov = float(numbers(frame["fov"], (), f"fov of frame {i}", path))
+        if not 0 < fov < 180:
+            raise InputError(f"{path}: the fov of frame {i} is {fov:g}; expected degrees between 0 and 180.")
+        poses.append(numbers(frame["world_from_camera"], (4, 4), f"world_from_camera of frame {i}", path))
+        focal = sizes[1] / (2 * math.tan(math.radians(fov) / 2))
+        k = [[focal, 0, sizes[0] / 2], [0, focal, sizes[1] / 2], [0, 0, 1]]
+        intrinsics.append(torch.tensor(k, dtype=torch.float64))
+    cameras = Cameras(torch.stack(intrinsics), torch.stack(poses), torch.tensor([sizes] * len(poses)))
+    try:
+        cameras.validate([f"frame {i}" for i in range(len(cameras))])
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+    return CameraPath(cameras, float(fps))
+
+
+def write_renders(source: Source, path: CameraPath, folder: Path) -> int:
+    """Render a path given in the source's export frame: frame_0000.png, depth_0000.png, ..., path.mp4; how many."""
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras = source.frame_from_scene.inverse().cameras(path.cameras)
+    for i, render in enumerate(render_views(source, cameras)):
+        write_png(folder / f"frame_{i:04d}.png", render.image)
+        write_png(folder / f"depth_{i:04d}.png", depth_picture(render.depth.numpy()))
+    files = [folder / f"frame_{i:04d}.png" for i in range(len(cameras))]
+    return write_video(folder / "path.mp4", (read_image(file)[0] for file in files), path.fps)

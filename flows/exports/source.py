@@ -1,0 +1,113 @@
+"""A finished run as the exports read it: its field, its cameras, its views, and the frame of what is written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from cat3d_core.cameras import Cameras
+from cat3d_core.nerf import Field, ReconstructConfig, Render, render_image
+from cat3d_core.normalization import Similarity
+from flows.progress import meter
+from flows.readers.base import InputError
+from flows.stages.common import read_cameras, read_images, read_similarity, views_with_role
+from flows.stages.reconstruct import generated_views
+from schemas.scene_store import Run, SceneStore
+
+FRAMES = ("world", "scene")
+IDENTITY = Similarity(1.0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+
+
+@dataclass(frozen=True)
+class Source:
+    """`frame_from_scene` maps the scene frame (unit distance to the looked-at origin, +z up) to the frame of exports:
+    the data set's own world, or the scene frame itself."""
+
+    store: SceneStore
+    run: Run
+    field: Field
+    frame_from_scene: Similarity
+
+
+def open_source(path: Path, run_name: str | None, frame: str) -> Source:
+    """Open a run for export. Raises InputError for an unknown frame, an undecided or unfinished run, StoreError for a
+    damaged store."""
+    if frame not in FRAMES:
+        raise InputError(f'There is no frame "{frame}"; choose {" or ".join(FRAMES)}.')
+    store = SceneStore.open(path)
+    names = store.runs()
+    if run_name is None and len(names) != 1:
+        known = f"it has the runs {', '.join(names)}; choose one with --run" if names else "it has no run yet"
+        raise InputError(f"{path} cannot be exported as it is: {known}.")
+    run = store.run(run_name or names[0])
+    frame_from_scene = read_similarity(store).inverse() if frame == "world" else IDENTITY
+    return Source(store, run, _read_field(store, run), frame_from_scene)
+
+
+def _read_field(store: SceneStore, run: Run) -> Field:
+    """The field with the settings it was trained with, which need not be those of today's presets."""
+    record = store.record("reconstruct", run.name)
+    if record is None:
+        raise InputError(
+            f"The run {run.name} of {store.folder} has no finished field; finish it with `cat3d run` first."
+        )
+    settings = record.inputs["trainer"]
+    state = {name: torch.from_numpy(run.field.read(name)) for name in run.field.attrs["parameters"]}
+    try:
+        config = ReconstructConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()})
+        field = Field.from_state(config, state)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"The field of {run.name} in {store.folder} was trained by another version of cat3d and cannot be read "
+            f"({error}); reconstruct it again with `cat3d reprocess`."
+        ) from None
+    return field.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """Views the field was trained on: cameras (N) in the scene frame; images N x (h, w, 3) uint8; for each its name in
+    the data set, or None for a generated view."""
+
+    cameras: Cameras
+    images: list[torch.Tensor]
+    captured_name: list[str | None]
+
+
+def training_images(source: Source) -> PosedImages:
+    """The run's captured training views, then its generated views where it has them. Held-out views are left out."""
+    store, run = source.store, source.run
+    train = views_with_role(store, run, "train")
+    cameras, images = [read_cameras(store.captured, train)], read_images(store.captured, train)
+    names: list[str | None] = [str(name) for name in store.captured.read("name")[train]]
+    if "done_image" in run.generated:
+        for camera, image in generated_views(run):
+            cameras.append(camera)
+            images.append(image)
+            names.append(None)
+    return PosedImages(Cameras.cat(cameras), images, names)
+
+
+def surface_cameras(source: Source, limit: int) -> Cameras:
+    """At most `limit` cameras (scene frame) that see the surface: training views, generated views, the video's path,
+    thinned evenly."""
+    store, run = source.store, source.run
+    cameras = [read_cameras(store.captured, views_with_role(store, run, "train"))]
+    if "done_image" in run.generated:
+        cameras += [camera for camera, _ in generated_views(run)]
+    if "path" in run.section("renders"):
+        cameras.append(read_cameras(run.renders("path")))
+    every = Cameras.cat(cameras)
+    return every[torch.linspace(0, len(every) - 1, min(limit, len(every))).round().long()]
+
+
+def render_views(source: Source, cameras: Cameras, scale: float = 1.0) -> Iterator[Render]:
+    """Render each camera (scene frame) at `scale` times its size; tensors on the CPU, one view at a time."""
+    with meter(f"render {source.store.scene_id} {source.run.name}", len(cameras)) as progress:
+        for index in range(len(cameras)):
+            render = render_image(source.field, cameras.to(dtype=torch.float32), index, resolution_scale=scale)
+            yield Render(**{name: value.cpu() for name, value in vars(render).items()})
+            progress.advance()
