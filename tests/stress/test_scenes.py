@@ -312,6 +312,17 @@ def test_epsilon_prediction_needs_a_terminal_signal() -> None:
     assert finite(schedule.clean(torch.ones(3), torch.ones(3), schedule.log_snr[-1]))
 
 
+def test_autoencoder_of_images_that_break_others() -> None:
+    """Found by `cat3d stress`: an empty batch failed inside torch's pixel unshuffle, about channels."""
+    autoencoder = random_model().autoencoder
+    for image in (torch.zeros(1, 3, 16, 16), torch.ones(1, 3, 8, 64), torch.full((2, 3, 8, 8), 0.5)):
+        latents = autoencoder.encode(image)
+        assert finite(latents, autoencoder.decode(latents), autoencoder.decode(latents * 1e6))
+    for shape in ((0, 3, 16, 16), (1, 3, 1, 4096), (1, 3, 1, 1)):
+        with pytest.raises(ValueError, match="multiples of 8"):
+            autoencoder.encode(torch.zeros(shape))
+
+
 @pytest.mark.slow
 def test_a_thousand_steps_of_the_network() -> None:
     config = SamplerConfig("unipc", "log_snr", 1000, GuidanceConfig(scale=3.0))
