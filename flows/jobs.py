@@ -112,13 +112,24 @@ def make_jobs(
 ) -> tuple[Capture, list[Job]]:
     """Read the scene and make one job per split. Raises InputError for bad input or an unknown split."""
     capture = read_capture(source, reader, image_folder)
-    jobs = [
-        Job(source=str(source), reader=reader, image_folder=image_folder, out=out, scene_id=capture.scene_id,
-            dataset=capture.dataset, config=config.model_copy(update={"split": str(v)}))
-        for v in views
-    ]  # fmt: skip
-    for job in jobs:
-        job.split(capture)
+    job = Job(
+        source=str(source),
+        reader=reader,
+        image_folder=image_folder,
+        out=out,
+        scene_id=capture.scene_id,
+        dataset=capture.dataset,
+        config=config,
+    )
+    jobs = []
+    for split in views:
+        one = job.model_copy(update={"config": config.model_copy(update={"split": str(split)})})
+        few = len(one.split(capture)["train"]) == 1
+        if config.method == "auto":
+            one = one.model_copy(
+                update={"config": one.config.model_copy(update={"method": "cat3d" if few else "zipnerf"})}
+            )
+        jobs.append(one)
     return capture, jobs
 
 

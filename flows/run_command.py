@@ -21,10 +21,11 @@ OPTION_FIELDS = {
     "method": ("method",),
     "preset": ("reconstruct", "preset"),
     "seed": ("seed",),
+    "model": ("sample", "checkpoint"),
     "trajectory": ("plan", "trajectory"),
     "count": ("plan", "views"),
 }
-DEMO_SOURCE = "procedural:llff/1"
+DEMO_SOURCE = "procedural:co3d/4?views=16&width=96&height=96"
 
 
 def run_command(
@@ -67,14 +68,20 @@ def run_command(
 
 
 def demo_command(out: Path, smallest: bool) -> None:
-    """A procedural scene, three views and all, at a size that two cores finish in minutes."""
-    given = {"downscale": 2 if smallest else 1, "preset": "fast"}
-    settings = ["render.path_views=24"]
-    views = ["3", "all"]
-    if smallest:
-        settings = ["render.path_views=4", "reconstruct.overrides={iterations: 60, batch_rays: 512}"]
-        views = ["3"]
-    run_command(DEMO_SOURCE, out, views, given, settings=settings)
+    """A procedural scene: three views with and without generated ones, and all views, at a size for two cores."""
+    given: dict[str, Any] = {"downscale": 3.0 if smallest else 1.0, "preset": "fast", "seed": 0}
+    iterations = 60 if smallest else 400
+    settings = [
+        f"reconstruct.overrides={{iterations: {iterations}, warmup_iterations: {iterations // 10}}}",
+        f"render.path_views={4 if smallest else 24}",
+        f"plan.views={5 if smallest else 20}",
+    ]
+    from flows.server import prefect_server
+
+    # One server for both: Prefect's client keeps its connection to the first one for as long as the process lives.
+    with prefect_server(out.resolve() / ".prefect"):
+        for method, views in (("zipnerf", ["3"] if smallest else ["3", "all"]), ("cat3d", ["3"])):
+            run_command(DEMO_SOURCE, out, views, given | {"method": method}, settings=settings)
 
 
 def make_config(given: dict[str, Any], config_file: Path | None, settings: Sequence[str]) -> RunConfig:

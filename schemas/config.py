@@ -161,8 +161,8 @@ class EvaluateConfig(_Model):
 class RunConfig(_Model):
     """One run of one scene."""
 
-    method: Literal["zipnerf", "cat3d"] = "zipnerf"
-    """`zipnerf` fits the captured views alone; `cat3d` generates views first."""
+    method: Literal["auto", "zipnerf", "cat3d"] = "auto"
+    """`zipnerf` fits the captured views alone; `cat3d` generates views first; `auto`: cat3d for a single photo."""
     label: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,40}$")] | None = None
     """Name of the variant in run names and tables; None: the method's name."""
     split: Annotated[str, Field(coerce_numbers_to_str=True)] = "all"

@@ -91,7 +91,7 @@ def test_second_run_does_nothing_and_says_so(finished: Path, cat3d) -> None:
 )
 def test_a_changed_setting_makes_exactly_its_stages_stale(finished: Path, change: list[str], stale: list[str]) -> None:
     settings = [v for flag, v in zip(TINY[::2], TINY[1::2]) if flag == "--set"]
-    given = {"downscale": 1, "method": "zipnerf", "preset": "fast", "seed": 0}
+    given = {"downscale": 1, "method": "auto", "preset": "fast", "seed": 0}
     if change[0] == "--set":
         settings.append(change[1])
     else:
