@@ -184,6 +184,31 @@ def results(
 
 
 @app.command()
+def train(
+    config: Annotated[
+        str, typer.Argument(help="A training's YAML file, or the name of a shipped preset (see --list).")
+    ] = "",
+    out: OutOption = Path("outputs/training"),
+    list_: Annotated[bool, typer.Option("--list", help="List the shipped presets.")] = False,
+    steps: Annotated[int | None, typer.Option(help="Optimizer steps, instead of the configuration's.")] = None,
+    minutes: Annotated[float | None, typer.Option(help="Or the time spent in training.")] = None,
+    autoencoder: Annotated[Path | None, typer.Option(help="Take the autoencoder of this file.")] = None,
+    start: Annotated[Path | None, typer.Option(help="Weights to start from.")] = None,
+    seed: Annotated[int | None, typer.Option(help="All randomness follows from it.")] = None,
+    device: Annotated[str | None, typer.Option(help="auto, cpu or cuda.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="One setting, e.g. --set optimizer.groups=8. May be repeated.")
+    ] = None,
+) -> None:
+    """Train a multi-view diffusion model on procedural scenes; run again, it goes on where it was stopped."""
+    from flows.train_command import train_command
+
+    path = str(autoencoder) if autoencoder else None
+    given = {"steps": steps, "minutes": minutes, "seed": seed, "device": device, "start": str(start) if start else None}
+    train_command(config, out, given | ({"autoencoder": {"path": path}} if path else {}), set_ or [], list_)
+
+
+@app.command()
 def stress(
     quick: Annotated[bool, typer.Option("--quick", help="Under a minute: a few thousand cases a routine.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,

@@ -1,0 +1,82 @@
+"""The model that a training starts from: configuration, autoencoder, starting weights."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cat3d_core.diffusion import SIZES, Autoencoder, ModelConfig, MultiViewModel, load_model
+from cat3d_core.diffusion.config import from_dict
+from cat3d_core.diffusion.pretrained import load_stable_diffusion
+
+
+def model_config(
+    size: str,
+    image_size: int | None = None,
+    views: int = 8,
+    unet: dict[str, Any] | None = None,
+    autoencoder: dict[str, Any] | None = None,
+    schedule: dict[str, Any] | None = None,
+) -> ModelConfig:
+    """A built-in size with fields replaced. Raises ValueError naming a field that doesn't exist or fit."""
+    document = dataclasses.asdict(SIZES[size])
+    document["views"] = views
+    if image_size is not None:
+        document["unet"]["latent_size"] = image_size // 8
+    for part, changes in (("unet", unet), ("autoencoder", autoencoder), ("schedule", schedule)):
+        document[part] |= changes or {}
+    return from_dict(ModelConfig, document)
+
+
+def starting_config(config: ModelConfig, start: Path | None) -> ModelConfig:
+    """`config`, or where the weights of another program's U-Net come in, that network's layout with our cameras and
+    views. Raises ValueError for a model file of ours with another U-Net."""
+    if start is None:
+        return config
+    if _is_ours(start):
+        theirs = load_model(start).config
+        if theirs.unet != config.unet:
+            raise ValueError(f"{start} holds another U-Net than the one asked for: {_differences(theirs, config)}.")
+        return config
+    return dataclasses.replace(config, unet=_from_stable_diffusion(start, config)[0].config)
+
+
+def starting_model(config: ModelConfig, autoencoder: Autoencoder, start: Path | None, seed: int) -> MultiViewModel:
+    """The model at step 0; `config` as `starting_config` gives it. Random weights depend on the seed alone."""
+    torch.manual_seed(seed)
+    model = MultiViewModel(config)
+    model.autoencoder = autoencoder
+    if start is None:
+        # No pretrained network has to be kept as it is: let the rays in from the first step.
+        torch.nn.init.kaiming_uniform_(model.unet.conv_in.weight, a=5**0.5)
+    elif _is_ours(start):
+        model.unet.load_state_dict(load_model(start).unet.state_dict())
+    else:
+        model.unet = _from_stable_diffusion(start, config)[0]
+    return model
+
+
+def _is_ours(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    from cat3d_core.diffusion import describe
+
+    try:
+        describe(path)
+    except ValueError:
+        return False
+    return True
+
+
+def _from_stable_diffusion(path: Path, config: ModelConfig) -> Any:
+    kept = ("latent_channels", "latent_size", "view_attention", "max_3d_size", "decoder_only", "camera", "ray_octaves")
+    changes = {name: getattr(config.unet, name) for name in kept}
+    return load_stable_diffusion(path, **changes)
+
+
+def _differences(theirs: ModelConfig, ours: ModelConfig) -> str:
+    one, other = dataclasses.asdict(theirs.unet), dataclasses.asdict(ours.unet)
+    return ", ".join(f"{name} is {one[name]} there and {other[name]} here" for name in one if one[name] != other[name])

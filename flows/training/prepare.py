@@ -1,0 +1,131 @@
+"""What a training works on: rendered scenes, an autoencoder, the bank of latents. Made once, kept in a folder."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cat3d_core.diffusion import Autoencoder, LatentBank, ModelConfig, load_model
+from cat3d_core.weights import default_model_path
+from flows.images import read_image
+from flows.progress import console, meter
+from flows.readers.base import InputError
+from flows.training import renders
+from flows.training.autoencoder import load_autoencoder, reconstruction_psnr, save_autoencoder, train_autoencoder
+from flows.training.bank import encode_shards, load_bank
+from flows.training.ranks import Ranks
+from schemas.errors import ConfigError
+from schemas.training import TrainRunConfig
+
+AUTOENCODER = "autoencoder.safetensors"
+
+
+def prepare(config: TrainRunConfig, network: ModelConfig, folder: Path, own: Ranks) -> tuple[Autoencoder, LatentBank]:
+    """Render, get the autoencoder, encode; each is skipped where its result is in `folder`. The ranks share the work.
+
+    Raises ConfigError for a bank that is too large, or a folder that holds another one."""
+    bank, size = config.bank, network.image_size
+    needed = renders.bank_bytes(bank.scenes, bank.views, size, bank.variants, network.unet.latent_channels)
+    if needed > bank.max_gib * 2**30:
+        raise ConfigError(
+            f"The bank would take {needed / 2**30:.1f} GiB, more than bank.max_gib = {bank.max_gib:g} allows; ask for "
+            "fewer scenes, views or variants, or allow more."
+        )
+    if own.first:
+        claim(folder / "bank.json", _identity(config, network))
+    own.barrier()
+    mine = renders.shard_numbers(bank.scenes)[own.rank :: own.world]
+    photos = read_photos(bank.textures) if bank.textures else None
+    scenes = sum(min(renders.SHARD_SCENES, bank.scenes - n * renders.SHARD_SCENES) for n in mine)
+    with meter("render scenes", scenes) as bar:
+        renders.render_shards(
+            folder, bank.families, bank.scenes, bank.views, size, config.seed, photos, own.device, mine, bar.advance
+        )
+    own.barrier()
+    autoencoder = get_autoencoder(config, network, folder, photos, own)
+    with meter("encode shards", len(mine)) as bar:
+        encode_shards(folder, autoencoder, bank.variants, own.device, mine, bar.advance)
+    own.barrier()
+    latents = load_bank(folder, size)
+    console.print(f"  bank: {len(latents)} scenes of {bank.views} views, {needed / 2**20:.0f} MiB in {folder}")
+    return autoencoder.cpu(), latents
+
+
+def _identity(config: TrainRunConfig, network: ModelConfig) -> dict[str, Any]:
+    """What the contents of a bank depend on."""
+    bank = config.bank.model_dump(mode="json", exclude={"folder", "max_gib"})
+    network_document = json.loads(network.to_json())["autoencoder"]
+    wanted = config.autoencoder.model_dump(mode="json")
+    return {"bank": bank, "image_size": network.image_size, "seed": config.seed, "network": network_document,
+            "autoencoder": wanted}  # fmt: skip
+
+
+def claim(path: Path, document: dict[str, Any], free: frozenset[str] = frozenset()) -> None:
+    """Record in `path` what its folder holds. Raises ConfigError if it holds something else; entries in `free` may
+    differ."""
+    if path.exists():
+        earlier = json.loads(path.read_text())
+        changed = [name for name in document if name not in free and document[name] != earlier.get(name)]
+        if changed:
+            raise ConfigError(
+                f"{path} belongs to a training with other settings ({', '.join(changed)}); go on with the same, or "
+                "choose another folder."
+            )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(document, indent=1))
+    partial.replace(path)
+
+
+def get_autoencoder(
+    config: TrainRunConfig, network: ModelConfig, out: Path, photos: torch.Tensor | None, own: Ranks
+) -> Autoencoder:
+    """The autoencoder kept in `out`; before that the given one, the shipped model's, or one trained by rank 0.
+
+    Raises ConfigError for a file whose autoencoder is not the one asked for."""
+    path, wanted = out / AUTOENCODER, config.autoencoder
+    if own.first and not path.exists():
+        autoencoder, source = _ready_made(config, network)
+        pictures = renders.rendered_images(out, 4096)
+        if autoencoder is None:
+            source = f"trained for {wanted.minutes:g} minutes"
+            with meter("train the autoencoder", round(60 * wanted.minutes)) as bar:
+                autoencoder = train_autoencoder(
+                    network.autoencoder, pictures, photos, 60 * wanted.minutes, wanted.batch, wanted.learning_rate,
+                    config.seed, own.device,
+                    lambda passed, step, psnr: bar.update(round(passed * bar.total), f"{psnr:.1f} dB"),
+                )  # fmt: skip
+        quality = reconstruction_psnr(autoencoder, pictures[-256:].float() / 255)
+        save_autoencoder(path, autoencoder, {"source": source, "renders_psnr_db": quality})
+        console.print(f"  autoencoder: {source}; {quality:.1f} dB on the bank's renders")
+    own.barrier()
+    return load_autoencoder(path)
+
+
+def _ready_made(config: TrainRunConfig, network: ModelConfig) -> tuple[Autoencoder | None, str]:
+    if config.autoencoder.path is not None:
+        found = load_autoencoder(config.autoencoder.path)
+        if found.config != network.autoencoder:
+            raise ConfigError(
+                f"autoencoder.path: {config.autoencoder.path} holds {found.config}, but the model asks for "
+                f"{network.autoencoder}; set model.autoencoder to match, or leave the path out."
+            )
+        return found, f"from {config.autoencoder.path}"
+    if config.autoencoder.shipped:
+        with contextlib.suppress(FileNotFoundError):
+            shipped = load_model(default_model_path()).autoencoder
+            if shipped.config == network.autoencoder:
+                return shipped, "of the shipped model"
+    return None, ""
+
+
+def read_photos(folder: Path) -> torch.Tensor:
+    """Centre squares (M, 3, S, S) in [0, 1] of the .jpg files of a folder, in the order of their names."""
+    paths = sorted(folder.glob("*.jpg"))
+    if not paths:
+        raise InputError(f"bank.textures: there are no .jpg photographs in {folder}.")
+    return renders.squares([torch.from_numpy(read_image(p)[0].copy()).permute(2, 0, 1) for p in paths])
