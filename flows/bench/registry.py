@@ -16,11 +16,13 @@ import torch
 
 from cat3d_core.diffusion import load_model
 from cat3d_core.metrics.perceptual import find_perceptual
+from cat3d_core.nerf import PRESETS
 from cat3d_core.weights import default_model_path
 from flows.bench import metrics, model, plan, poses, reconstruct, sampler, store, synthetic
 from flows.images import read_image
 from flows.readers import read_capture
 from flows.readers.base import InputError
+from flows.sampling.model import SAMPLER_DEFAULT
 from schemas.config import PosesConfig, ReconstructConfig, SampleConfig
 
 Row = dict[str, Any]
@@ -85,33 +87,33 @@ def _scenes(data: Path | None, names: list[str]) -> list[Path]:
 
 def sampler_rows(quick: bool, data: Path | None) -> list[Row]:
     """The closed-form mixture, and in full also the shipped model where there is one."""
-    default = SampleConfig()
-    steps = tuple(sorted({10, 20, 50, default.steps} if quick else {10, 15, 20, 30, 50, default.steps}))
-    rows = sampler.rows(None, steps, groups=16 if quick else 64)
+    chosen = {name: SAMPLER_DEFAULT[name] for name in ("solver", "nodes", "steps")} | {"dtype": SampleConfig().precision}
+    steps = tuple(sorted({10, 20, 50, SAMPLER_DEFAULT["steps"]} | (set() if quick else {15, 30})))
+    rows = sampler.rows(None, steps, groups=8 if quick else 64)
     if not quick:
         with contextlib.suppress(MissingError):
             rows += sampler.rows(_model_file(), steps)
-    chosen = {"solver": default.solver, "nodes": default.nodes, "steps": default.steps, "dtype": default.precision}
-    low, high = default.guidance_log_snr
-    return _marked(rows, chosen | ({"interval": "all"} if low is None and high is None else {}))
+    return _marked(rows, chosen | {"interval": "all"})
 
 
 def reconstruct_rows(quick: bool, data: Path | None) -> list[Row]:
     """Presets (`paper` on a GPU only) and what changes around the default one, on procedural scenes."""
-    default = ReconstructConfig().preset
+    default: str = ReconstructConfig().preset
     rows: list[Row] = []
     for device in _devices():
         if quick:
-            size: Row = {"train": 12, "test": 3, "size": 40, "device": device}
-            rows += reconstruct.curves("tiny", vary=(), **size)
-            rows += reconstruct.curves(default, vary=("samples", "multisamples"), iterations=200, **size)
+            size: Row = {"train": 16, "test": 3, "size": 48, "device": device}
+            for preset in ("tiny", default):
+                rows += reconstruct.curves(preset, vary=(), **size)
+            rows += reconstruct.curves(default, vary=("samples",), iterations=200, **size)
         else:
             size = {"families": ("mip360", "dtu"), "device": device}
             vary = tuple(reconstruct.VARIATIONS)
             presets = ["tiny", "fast", "balanced", *(["paper"] if device == "cuda" else [])]
             for preset in presets:
                 rows += reconstruct.curves(preset, vary=vary if preset == default else (), **size)
-    return _marked(rows, {"preset": default, "varied": "preset"})
+    whole = float(PRESETS[default].iterations)
+    return _marked(rows, {"preset": default, "varied": "preset", "iterations": whole})
 
 
 def kernel_rows(quick: bool, data: Path | None) -> list[Row]:
@@ -175,8 +177,8 @@ BENCHES: dict[str, Bench] = {
     "reconstruct": Bench(
         "held-out PSNR of the field against seconds of training: presets, samples, grid, batch",
         reconstruct_rows,
-        (Panel("Reconstruction", "seconds", "psnr_db", ("varied",), ("preset", "setting"), ("family", "device"),
-               higher_is_better=True),),
+        (Panel("Reconstruction", "seconds", "psnr_db", ("preset", "varied"), ("setting", "iterations"),
+               ("family", "device"), higher_is_better=True),),
     ),
     "kernels": Bench("the hash grid query beside plain torch and the memory's floor", kernel_rows),
     "poses": Bench(
@@ -196,7 +198,8 @@ BENCHES: dict[str, Bench] = {
         (
             Panel("Store, time and size", "ms_per_view", "bytes_per_view", ("codec",), each=("content", "source"),
                   where=(("store_format", True),)),
-            Panel("Store, size and error", "bytes_per_view", "error", ("format",), ("codec",), ("content", "source")),
+            Panel("Store, size and error", "bytes_per_view", "error", ("format",), each=("content", "source"),
+                  where=(("store_codec", True),)),
         ),
     ),
     "model": Bench("samples of the shipped model on held-out scenes, beside baselines and ceiling", model_rows),

@@ -15,6 +15,10 @@ from flows.jobs import Job
 from flows.readers.base import InputError
 
 
+#: On the front of `cat3d bench sampler`: error against evaluations on a problem with a known answer.
+SAMPLER_DEFAULT = {"solver": "unipc", "nodes": "log_snr", "steps": 20, "guidance": 3.0}
+
+
 def checkpoint_path(job: Job) -> Path:
     """The model file of the job. Raises InputError where there is none."""
     given = job.config.sample.checkpoint
@@ -71,13 +75,21 @@ def device() -> str:
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
+def sampler_settings(job: Job) -> dict[str, Any]:
+    """Solver, nodes, steps and guidance: the run's own where given, else the model's, else the measured default."""
+    recommended = SAMPLER_DEFAULT | _description(job)["provenance"].get("sampler", {})
+    own = {name: getattr(job.config.sample, name) for name in SAMPLER_DEFAULT}
+    return {name: recommended[name] if value is None else value for name, value in own.items()}
+
+
 def sampler_config(job: Job) -> SamplerConfig:
     """The core's settings of the sampler for the run's."""
     settings = job.config.sample
+    chosen = sampler_settings(job)
     low, high = settings.guidance_log_snr
     guidance = GuidanceConfig(
-        settings.guidance,
+        chosen["guidance"],
         low_log_snr=-torch.inf if low is None else low,
         high_log_snr=torch.inf if high is None else high,
     )
-    return SamplerConfig(settings.solver, settings.nodes, settings.steps, guidance)
+    return SamplerConfig(chosen["solver"], chosen["nodes"], chosen["steps"], guidance)

@@ -10,7 +10,7 @@ import torch
 from flows.jobs import Job, Outcome
 from flows.sampling.fan_out import fan_out
 from flows.sampling.groups import Group, StoredPlan, view_keys
-from flows.sampling.model import model_config, model_hash, sampler_config, shared_model
+from flows.sampling.model import model_config, model_hash, sampler_config, sampler_settings, shared_model
 from flows.sampling.shrinking import sample_at_most
 from flows.sampling.work import Work, is_done
 from schemas.scene_store import SceneStore
@@ -19,8 +19,8 @@ VERSION = 1
 
 
 def inputs(job: Job) -> dict[str, Any]:
-    """The model's weights."""
-    return {"model": model_hash(job)}
+    """The model's weights, and the sampler it is used with."""
+    return {"model": model_hash(job), "sampler": sampler_settings(job)}
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
@@ -29,7 +29,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     groups = [g for items in work.passes for g in items]
     totals = fan_out([work], job.config.execution, f"sample {job.scene_id} {job.run}")
     counts = {"views": sum(len(work.views[g]) for g in groups), "groups": len(groups)}
-    return Outcome(counts | {"steps": job.config.sample.steps * len(groups)} | totals.work(), totals.decisions)
+    return Outcome(counts | {"steps": sampler_settings(job)["steps"] * len(groups)} | totals.work(), totals.decisions)
 
 
 def sample_work(job: Job, store: SceneStore, key: str) -> Work:
