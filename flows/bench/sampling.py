@@ -72,7 +72,7 @@ def batch_row(job: Job, executor: str, count: int = 40) -> dict[str, Any]:
     started = time.monotonic()
     open_one = open_executor(job.config.execution, job.out / ".work")
     try:
-        times = []
+        times: list[float] = []
         for number in range(count):
             sent = time.monotonic()
             open_one.submit(Batch(number=number, job=job, stage="sample", key="0" * 64, items=(0,)))
@@ -81,13 +81,15 @@ def batch_row(job: Job, executor: str, count: int = 40) -> dict[str, Any]:
             answers[0].raise_error()
             times.append(time.monotonic() - sent)
             if number == 0:
-                start_up = time.monotonic() - started
+                start_up, first_cpu = time.monotonic() - started, time.process_time()
+        cpu = (time.process_time() - first_cpu) / (count - 1)
     finally:
         open_one.close()
     rest = np.array(times[1:])
     return {
         "what": "batch", "executor": executor, "first_s": start_up, "median_s": float(np.median(rest)),
         "p90_s": float(np.quantile(rest, 0.9)), "in_worker_s": answers[0].seconds,
+        "parent_cpu_s": cpu,
     }  # fmt: skip
 
 
@@ -105,11 +107,11 @@ def store_rows(job: Job, folder: Path, views: int = 400) -> Iterator[dict[str, A
         "latent read": lambda v: generated.read("latent", [v]),
     }
     for name, operation in operations.items():
-        started = time.monotonic()
+        started, started_cpu = time.monotonic(), time.process_time()
         for view in range(views):
             operation(view)
-        seconds = time.monotonic() - started
-        yield {"what": "store", "operation": name, "per_second": views / seconds, "ms": 1000 * seconds / views}
+        wall, cpu = time.monotonic() - started, time.process_time() - started_cpu
+        yield {"what": "store", "operation": name, "wall_ms": 1000 * wall / views, "cpu_ms": 1000 * cpu / views}
 
 
 def main() -> None:
@@ -125,10 +127,10 @@ def main() -> None:
         job = prepared(work, arguments.model and arguments.model.resolve(), arguments.groups)
         for row in store_rows(job, work):
             print(row, flush=True)
-        for text in arguments.executors.split(","):
-            executor, workers = text.split(":")
+        chosen = [text.split(":") for text in arguments.executors.split(",")]
+        for executor, workers in chosen:
             print(share_row(job, executor, int(workers)), flush=True)
-        for executor in sorted({text.split(":")[0] for text in arguments.executors.split(",")}):
+        for executor in sorted({executor for executor, _ in chosen}):
             print(batch_row(job, executor), flush=True)
 
 

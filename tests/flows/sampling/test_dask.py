@@ -1,0 +1,55 @@
+"""A Dask cluster that is running already: the same store, also when its workers are killed or hang."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+
+import distributed
+import numpy as np
+import pytest
+
+from tests.flows.sampling.scene import chunk_times, run_of, run_stages
+
+
+@pytest.fixture(scope="module")
+def cluster(prefect_url: str) -> Iterator[distributed.LocalCluster]:
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0", resources={"GPU": 1},
+        silence_logs=50,
+    ) as cluster:  # fmt: skip
+        yield cluster
+
+
+@pytest.mark.parametrize("kind", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])
+def test_a_lost_dask_workers_groups_are_taken_over(scene, expected, cluster, kind: signal.Signals) -> None:
+    job = scene(
+        executor="dask",
+        dask_address=cluster.scheduler_address,
+        dask_resources="{GPU: 1}",
+        batch_seconds=100,
+        timeout_s=30,
+    )
+    struck: list[int] = []
+
+    def strike() -> None:
+        while not chunk_times(job):
+            time.sleep(0.02)
+        with distributed.Client(cluster.scheduler_address, set_as_default=False) as client:
+            while not (busy := [a for a, batches in client.processing().items() if batches]):
+                time.sleep(0.01)
+            struck.append(client.run(os.getpid, workers=busy[:1])[busy[0]])
+            os.kill(struck[0], kind)
+
+    trouble = threading.Thread(target=strike)
+    trouble.start()
+    record = run_stages(job, "sample")["sample"]
+    trouble.join()
+    assert struck
+    assert record.work["workers"] == 2
+    assert np.array_equal(run_of(job).generated.read("latent"), expected["3"])
+    if kind == signal.SIGSTOP:
+        assert any("finished nothing for 30 s" in d for d in record.decisions)
