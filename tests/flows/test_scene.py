@@ -199,3 +199,27 @@ def test_bad_requests_end_in_a_sentence_and_an_exit_code(
     assert stopped.value.code == code
     assert sentence in " ".join((captured.out + captured.err).replace("│", " ").split())
     assert "Traceback" not in captured.err
+
+
+def test_auto_generates_views_for_a_single_photo_only(tmp_path: Path) -> None:
+    _, jobs = make_jobs(SCENE, tmp_path, ["1", "3", "all"], make_config({}, None, []))
+    assert [j.run for j in jobs] == ["v1-cat3d", "v3-zipnerf", "vall-zipnerf"]
+    _, asked = make_jobs(SCENE, tmp_path, ["3"], make_config({"method": "cat3d"}, None, []))
+    assert asked[0].run == "v3-cat3d"
+
+
+def test_the_sampler_is_the_runs_own_else_the_models_else_the_measured_default(tmp_path: Path) -> None:
+    from cat3d_core.diffusion import SIZES, MultiViewModel, save_model
+    from flows.sampling.model import SAMPLER_DEFAULT, sampler_settings
+
+    advice = {"solver": "ddim", "nodes": "trailing", "steps": 4, "guidance": 1.0}
+    for name, provenance in {"plain": {}, "advised": {"sampler": advice}}.items():
+        save_model(tmp_path / f"{name}.safetensors", MultiViewModel(SIZES["tiny"]), provenance)
+
+    def chosen(name: str, *settings: str) -> dict:
+        given = {"method": "cat3d", "model": str(tmp_path / f"{name}.safetensors")}
+        return sampler_settings(make_jobs(SCENE, tmp_path, ["3"], make_config(given, None, settings))[1][0])
+
+    assert chosen("plain") == SAMPLER_DEFAULT
+    assert chosen("advised") == advice
+    assert chosen("advised", "sample.steps=9") == advice | {"steps": 9}
