@@ -19,6 +19,11 @@ class Drawn:
     front: list[Row]
     defaults: list[Row]
 
+    def has_on_front(self, row: Row) -> bool:
+        """Whether nothing beats the row (an equal one may stand for it in `front`)."""
+        columns = (self.panel.cost, self.panel.value)
+        return any(all(row[c] == other[c] for c in columns) for other in self.front)
+
 
 def pareto_front(rows: list[Row], cost: str, value: str, higher_is_better: bool = False) -> list[Row]:
     """The rows that no other row equals or beats in both columns (of equal ones the first), cheapest first."""
@@ -56,7 +61,7 @@ def verdict(drawn: Drawn) -> list[str]:
         name = f"default {name_of(panel, row)}"
         cost, value = row[panel.cost], row[panel.value]
         better = [r for r in drawn.front if r[panel.cost] <= cost]
-        if any(r[panel.cost] == cost and r[panel.value] == value for r in drawn.front):
+        if drawn.has_on_front(row):
             out.append(f"{name}: on the front ({panel.cost} {cost:.4g}, {panel.value} {value:.4g}).")
         else:
             best = better[-1]  # along the front the value improves with the cost
@@ -64,4 +69,4 @@ def verdict(drawn: Drawn) -> list[str]:
                 f"{name}: not on the front ({panel.cost} {cost:.4g}, {panel.value} {value:.4g}); beaten by "
                 f"{name_of(panel, best)} ({best[panel.cost]:.4g}, {best[panel.value]:.4g})."
             )
-    return out or ["No row here is a default."]
+    return out

@@ -97,7 +97,9 @@ def cell(value: Any) -> str:
     """A value as a table shows it."""
     if isinstance(value, bool):
         return "yes" if value else ""
-    return f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
+    if isinstance(value, float):
+        return f"{value:.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.4g}"
+    return "" if value is None else str(value)
 
 
 def _sentence(text: str) -> str:
@@ -123,7 +125,7 @@ def _draw(panels: list[Drawn], path: Path) -> None:
         front = [[row[column] for row in drawn.front] for column in (panel.cost, panel.value)]
         axis.plot(*front, color="0.3", lw=1, zorder=1, label="front")
         for row in drawn.defaults:
-            on_front = any(row is one for one in drawn.front)
+            on_front = drawn.has_on_front(row)
             axis.scatter(
                 row[panel.cost], row[panel.value], s=190, marker="*", facecolor="gold" if on_front else "white",
                 edgecolor="black", zorder=3, label="default, on the front" if on_front else "default, not on the front",
@@ -137,11 +139,16 @@ def _draw(panels: list[Drawn], path: Path) -> None:
 
 def _scales(axis: Any, drawn: Drawn) -> None:
     """Logarithmic axes, but not for decibels and not where there is nothing but zeros."""
-    for column, scale in ((drawn.panel.cost, axis.set_xscale), (drawn.panel.value, axis.set_yscale)):
+    for column, scale, limit in (
+        (drawn.panel.cost, axis.set_xscale, axis.set_xlim),
+        (drawn.panel.value, axis.set_yscale, axis.set_ylim),
+    ):
         values = [row[column] for row in drawn.rows]
         if drawn.panel.higher_is_better and column == drawn.panel.value:
             continue
         if min(values) > 0:
             scale("log")
         elif max(values) > 0:
-            scale("symlog", linthresh=min(v for v in values if v > 0))
+            smallest = min(v for v in values if v > 0)
+            scale("symlog", linthresh=smallest)
+            limit(-0.3 * smallest, 2 * max(values))

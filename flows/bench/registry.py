@@ -14,7 +14,8 @@ from typing import Any
 
 import torch
 
-from cat3d_core.diffusion import load_model
+from cat3d_core.diffusion import GuidanceConfig, SamplerConfig, load_model
+from cat3d_core.diffusion.checkpoint import describe
 from cat3d_core.metrics.perceptual import find_perceptual
 from cat3d_core.nerf import PRESETS
 from cat3d_core.weights import default_model_path
@@ -87,13 +88,13 @@ def _scenes(data: Path | None, names: list[str]) -> list[Path]:
 
 def sampler_rows(quick: bool, data: Path | None) -> list[Row]:
     """The closed-form mixture, and in full also the shipped model where there is one."""
-    chosen = {name: SAMPLER_DEFAULT[name] for name in ("solver", "nodes", "steps")} | {"dtype": SampleConfig().precision}
+    chosen = {n: SAMPLER_DEFAULT[n] for n in ("solver", "nodes", "steps")} | {"dtype": SampleConfig().precision}
     steps = tuple(sorted({10, 20, 50, SAMPLER_DEFAULT["steps"]} | (set() if quick else {15, 30})))
     rows = sampler.rows(None, steps, groups=8 if quick else 64)
     if not quick:
         with contextlib.suppress(MissingError):
             rows += sampler.rows(_model_file(), steps)
-    return _marked(rows, chosen | {"interval": "all"})
+    return _marked(rows, chosen | {"interval": "all", "problem": "mixture"})  # a model's file has its own default
 
 
 def reconstruct_rows(quick: bool, data: Path | None) -> list[Row]:
@@ -154,8 +155,12 @@ def store_rows(quick: bool, data: Path | None) -> list[Row]:
 
 
 def model_rows(quick: bool, data: Path | None) -> list[Row]:
-    perceptual = find_perceptual()
-    return model.rows(load_model(_model_file()), 1 if quick else 20, perceptual=perceptual)
+    """As the model's file recommends to sample."""
+    path = _model_file()
+    chosen = SAMPLER_DEFAULT | describe(path)["provenance"].get("sampler", {})
+    config = SamplerConfig(chosen["solver"], chosen["nodes"], chosen["steps"], GuidanceConfig(chosen["guidance"]))
+    rows = model.rows(load_model(path), 1 if quick else 20, (3,) if quick else (3, 1), config, find_perceptual())
+    return [row | {name: chosen[name] for name in SAMPLER_DEFAULT} for row in rows]
 
 
 def synthetic_rows(quick: bool, data: Path | None) -> list[Row]:

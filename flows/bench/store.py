@@ -96,8 +96,8 @@ def rows(views: int = 8, size: int = 512, repeats: int = 5) -> list[dict[str, An
     """One row per content (image, latent), format and codec: `bytes_per_view` on disk, `ratio` (to the bytes in that
     format without compression), `write_mb_s` and `read_mb_s` (MB = 1e6 bytes before compression, best of `repeats`,
     the codecs taking turns), `ms_per_view` (written and read once), `error` (root mean square, in units of [0, 1] for
-    images and of the latents' standard deviation), `store_format` and `default`: whether the store uses the format, and
-    the format with the codec."""
+    images and of the latents' standard deviation), `store_format`, `store_codec`, `default`: whether the store uses the
+    format, the codec, and both for this content."""
     images, latents, source = views_and_latents(views, size)
     return _content_rows("image", images, "procedural", repeats) + _content_rows("latent", latents, source, repeats)
 
@@ -111,15 +111,17 @@ def photo_rows(photos: list[NDArray[np.uint8]], source: str, size: int, repeats:
 
 def _content_rows(kind: str, values: NDArray[np.float32], source: str, repeats: int) -> list[dict[str, Any]]:
     unit = float(values.std()) if kind == "latent" else 1.0
-    out = []
+    out, own = [], None
     for number, (name, convert) in enumerate(FORMATS[kind].items()):
         stored, decoded = convert(values)
         error = math.sqrt(float(np.square(decoded - values, dtype=np.float64).mean())) / unit
-        default = _default_codec(stored, kind) if number == 0 else None
+        if number == 0:
+            own = _default_codec(stored, kind)
         common = {"content": kind, "source": source, "format": name, "store_format": number == 0, "error": error}
         common |= {"views": len(values), "shape": "x".join(map(str, values.shape[1:]))}
         for codec, measured in _measure(stored, repeats).items():
-            out.append(common | {"codec": codec, "default": codec == default} | measured)
+            choice = {"codec": codec, "store_codec": codec == own, "default": number == 0 and codec == own}
+            out.append(common | choice | measured)
     return out
 
 
