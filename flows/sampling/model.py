@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +16,8 @@ from cat3d_core.weights import default_model_path
 from flows.jobs import Job
 from flows.readers.base import InputError
 
-
 #: On the front of `cat3d bench sampler`: error against evaluations on a problem with a known answer.
-SAMPLER_DEFAULT = {"solver": "unipc", "nodes": "log_snr", "steps": 20, "guidance": 3.0}
+SAMPLER_DEFAULT: dict[str, Any] = {"solver": "unipc", "nodes": "log_snr", "steps": 20, "guidance": 3.0}
 
 
 def checkpoint_path(job: Job) -> Path:
@@ -70,8 +71,15 @@ def _loaded(path: Path, _changed: int, where: str, precision: str) -> MultiViewM
     return model
 
 
+def forget_model() -> None:
+    """Free the memory of this process's model."""
+    _loaded.cache_clear()
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
+
+
 def device() -> str:
-    """This process's device. A worker sees one GPU only, see `flows/sampling/local.py` and `dask_cluster.py`."""
+    """This process's device. A worker sees one GPU only, see `local.py` and `dask_executor.py` here."""
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
@@ -80,6 +88,17 @@ def sampler_settings(job: Job) -> dict[str, Any]:
     recommended = SAMPLER_DEFAULT | _description(job)["provenance"].get("sampler", {})
     own = {name: getattr(job.config.sample, name) for name in SAMPLER_DEFAULT}
     return {name: recommended[name] if value is None else value for name, value in own.items()}
+
+
+@contextlib.contextmanager
+def cpu_threads(count: int) -> Iterator[None]:
+    """PyTorch with this many CPU threads: the same number in every process, as it may decide how sums are split."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def sampler_config(job: Job) -> SamplerConfig:

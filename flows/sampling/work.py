@@ -10,13 +10,12 @@ import time
 import traceback
 from collections.abc import Sequence
 
-import torch
 from pydantic import BaseModel, ConfigDict
 
 from cat3d_core.nerf import NonFiniteError
 from flows.jobs import Job
 from flows.readers.base import InputError
-from flows.sampling.model import shared_model
+from flows.sampling.model import cpu_threads, shared_model
 from schemas.errors import ConfigError, StoreError
 from schemas.scene_store import SceneStore, Section
 
@@ -61,12 +60,11 @@ def run_batch(batch: Batch) -> Answer:
     """Do a batch in this process, with the job's number of threads."""
     started = loaded = time.monotonic()
     try:
-        # The same number everywhere: it decides how sums are split on some machines.
-        torch.set_num_threads(batch.job.config.execution.threads)
-        shared_model(batch.job)
-        loaded = time.monotonic()
-        store = SceneStore.open(batch.job.store_path, "r+")
-        importlib.import_module(f"flows.stages.{batch.stage}").work(batch.job, store, batch.key, batch.items)
+        with cpu_threads(batch.job.config.execution.threads):
+            shared_model(batch.job)
+            loaded = time.monotonic()
+            store = SceneStore.open(batch.job.store_path, "r+")
+            importlib.import_module(f"flows.stages.{batch.stage}").work(batch.job, store, batch.key, batch.items)
     except Exception as error:
         kind = next((name for name, known in KNOWN_ERRORS.items() if isinstance(error, known)), type(error).__name__)
         message = str(error) if kind in KNOWN_ERRORS else traceback.format_exc()

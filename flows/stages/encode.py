@@ -11,9 +11,9 @@ import torch
 from cat3d_core.sample_sets import KINDS, source_boxes
 from flows.images import resize
 from flows.jobs import Job, Outcome
-from flows.progress import meter
+from flows.progress import Meter, meter
 from flows.sampling.groups import CAPTURED_LATENTS
-from flows.sampling.model import model_config, model_hash, shared_model
+from flows.sampling.model import cpu_threads, device, forget_model, model_config, model_hash, shared_model
 from schemas.content_key import content_key
 from schemas.scene_store import SceneStore
 
@@ -29,36 +29,42 @@ def inputs(job: Job) -> dict[str, Any]:
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     """Write `latents/captured` (and `captured_wide`) of all views with a pose: every run of the scene may use them."""
-    torch.set_num_threads(job.config.execution.threads)
-    model, config = shared_model(job), model_config(job)
-    unet = config.unet
     views = np.flatnonzero(store.captured.read("registered")).tolist()
     kinds = KINDS if job.config.plan.wide else KINDS[:1]
-    sizes = torch.from_numpy(store.captured.read("size").astype(np.int64))
-    encoded = 0
     with meter(f"encode {job.scene_id}", len(views) * len(kinds)) as progress:
-        for kind in kinds:
-            name = CAPTURED_LATENTS[kind]
-            marker = f"done_{name}"
-            store.latents.create_array(name, (len(sizes), unet.latent_channels, unet.latent_size, unet.latent_size))
-            store.latents.create_array(marker, (len(sizes), 32))
-            keys = [content_key(step=key, kind=kind, view=view) for view in range(len(sizes))]
-            done = store.latents.done(marker, keys, [name])
-            boxes = source_boxes(sizes, kind).tolist()
-            for view in views:
-                if not done[view]:
-                    square = square_image(store.captured.read_image("image", view), boxes[view], config.image_size)
-                    pixels = torch.from_numpy(square).permute(2, 0, 1)[None].float() / 255
-                    latent = model.autoencoder.encode(pixels.to(next(model.parameters()).device))
-                    store.latents.write_views(name, latent.half().cpu().numpy(), [view])
-                    store.latents.mark_done(marker, [keys[view]], [view])
-                    encoded += 1
-                progress.advance()
+        encoded = sum(encode_views(job, store, key, kind, views, progress) for kind in kinds)
+    forget_model()  # on a GPU its memory is wanted by the workers, and by the reconstruction
     return Outcome({"views": encoded, "evaluations": encoded})
 
 
+@torch.no_grad()
+def encode_views(job: Job, store: SceneStore, key: str, kind: str, views: list[int], progress: Meter) -> int:
+    """Encode those of the views that are missing; how many they were."""
+    name = CAPTURED_LATENTS[kind]
+    marker = f"done_{name}"
+    sizes = torch.from_numpy(store.captured.read("size").astype(np.int64))
+    config = model_config(job)
+    side = config.unet.latent_size
+    store.latents.create_array(name, (len(sizes), config.unet.latent_channels, side, side))
+    store.latents.create_array(marker, (len(sizes), 32))
+    keys = [content_key(step=key, kind=kind, view=view) for view in range(len(sizes))]
+    done = store.latents.done(marker, keys, [name])
+    boxes = source_boxes(sizes, kind).tolist()
+    missing = [view for view in views if not done[view]]
+    progress.advance(len(views) - len(missing))
+    with cpu_threads(job.config.execution.threads):
+        for view in missing:
+            square = square_image(store.captured.read_image("image", view), boxes[view], config.image_size)
+            pixels = torch.from_numpy(square).permute(2, 0, 1)[None].float() / 255
+            latent = shared_model(job).autoencoder.encode(pixels.to(device()))
+            store.latents.write_views(name, latent.half().cpu().numpy(), [view])
+            store.latents.mark_done(marker, [keys[view]], [view])
+            progress.advance()
+    return len(missing)
+
+
 def square_image(image: np.ndarray, box: Sequence[int], image_size: int) -> np.ndarray:
-    """(image_size, image_size, 3) uint8: the square [x0, y0, side] in pixels of the image, grey where it goes beyond."""
+    """(image_size, image_size, 3) uint8: the square [x0, y0, side] of the image in its pixels, grey beyond it."""
     x0, y0, side = box
     height, width = image.shape[:2]
     square = np.full((side, side, 3), PADDING, np.uint8)

@@ -87,7 +87,7 @@ def alike(groups: Sequence[Group], at_once: int) -> list[list[Group]]:
 def network_inputs(
     plan: StoredPlan, groups: Sequence[Group], shape: tuple[int, int, int]
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Of groups of one shape: conditioning latents [G, M, C, h, w], raymaps [G, M+N, 6, h, w], noise [G, N, C, h, w]."""
+    """For groups of one shape: given latents [G, M, C, h, w], raymaps [G, M+N, 6, h, w], noise [G, N, C, h, w]."""
     return (
         torch.stack([plan.condition_latents(g) for g in groups]),
         torch.stack([plan.raymaps(g, shape[-1]) for g in groups]),
