@@ -17,8 +17,8 @@ from rich.box import SIMPLE
 from rich.table import Column, Table
 
 import cat3d_core
-from flows.bench.fronts import verdict
-from flows.bench.page import cell, panels_of, tables, worth_showing, write_page
+from flows.bench.fronts import cell, verdict
+from flows.bench.page import panels_of, tables, worth_showing, write_page
 from flows.bench.registry import BENCHES, MissingError, Row
 from flows.errors import describe
 from flows.progress import console

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from flows.bench.registry import Panel, Row
 from flows.bench.sampler import front as lowest_front
@@ -54,19 +55,26 @@ def name_of(panel: Panel, row: Row) -> str:
     return " ".join(str(value) for value in values if value not in (None, ""))
 
 
+def cell(value: Any) -> str:
+    """A value as a table shows it."""
+    if isinstance(value, bool):
+        return "yes" if value else ""
+    if isinstance(value, float):
+        return f"{value:.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.4g}"
+    return "" if value is None else str(value)
+
+
 def verdict(drawn: Drawn) -> list[str]:
     """A sentence for each default: that it lies on the front, or what beats it in both and by how much."""
     panel, out = drawn.panel, []
     for row in drawn.defaults:
         name = f"default {name_of(panel, row)}"
-        cost, value = row[panel.cost], row[panel.value]
-        better = [r for r in drawn.front if r[panel.cost] <= cost]
+        place = f"({panel.cost} {cell(row[panel.cost])}, {panel.value} {cell(row[panel.value])})"
         if drawn.has_on_front(row):
-            out.append(f"{name}: on the front ({panel.cost} {cost:.4g}, {panel.value} {value:.4g}).")
+            out.append(f"{name}: on the front {place}.")
         else:
-            best = better[-1]  # along the front the value improves with the cost
-            out.append(
-                f"{name}: not on the front ({panel.cost} {cost:.4g}, {panel.value} {value:.4g}); beaten by "
-                f"{name_of(panel, best)} ({best[panel.cost]:.4g}, {best[panel.value]:.4g})."
-            )
+            # Along the front the value improves with the cost: the last that costs no more is the best of those.
+            best = [r for r in drawn.front if r[panel.cost] <= row[panel.cost]][-1]
+            rival = f"{name_of(panel, best)} ({cell(best[panel.cost])}, {cell(best[panel.value])})"
+            out.append(f"{name}: not on the front {place}; beaten by {rival}.")
     return out

@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from flows.bench.fronts import Drawn, drawn_panels, verdict
+from flows.bench.fronts import Drawn, cell, drawn_panels, verdict
 from flows.bench.registry import BENCHES, Row
 from schemas.errors import StoreError
 
@@ -62,7 +62,9 @@ def write_page(page: Path, folder: Path) -> None:
         if len(shown) < len(rows):
             kept = f"`{folder.name}/{name}.parquet`"
             lines += [f"Shown are the fronts and the defaults; all {len(rows)} rows are in {kept}.", ""]
-        lines += [f"<sub>{run['versions']}</sub>", ""]
+    for versions in dict.fromkeys(rows[0]["versions"] for rows in benches.values()):
+        names = ", ".join(name for name, rows in benches.items() if rows[0]["versions"] == versions)
+        lines += [f"Versions ({names}): {versions}.", ""]
     page.write_text("\n".join(lines), encoding="utf-8")
 
 
@@ -91,15 +93,6 @@ def tables(rows: list[Row]) -> list[tuple[Row, list[str], list[Row]]]:
         varying = [c for c in columns if c not in same]
         out.append(({c: members[0][c] for c in columns if c in same}, varying or list(columns), members))
     return out
-
-
-def cell(value: Any) -> str:
-    """A value as a table shows it."""
-    if isinstance(value, bool):
-        return "yes" if value else ""
-    if isinstance(value, float):
-        return f"{value:.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.4g}"
-    return "" if value is None else str(value)
 
 
 def _sentence(text: str) -> str:
@@ -132,6 +125,7 @@ def _draw(panels: list[Drawn], path: Path) -> None:
             )  # fmt: skip
         axis.set(title=drawn.title, xlabel=panel.cost, ylabel=panel.value)
         _scales(axis, drawn)
+        axis.tick_params(which="both", labelsize=6)
         axis.grid(alpha=0.3)
         axis.legend(fontsize=6)
     figure.savefig(path, dpi=100)

@@ -106,7 +106,7 @@ def reconstruct_rows(quick: bool, data: Path | None) -> list[Row]:
             size: Row = {"train": 16, "test": 3, "size": 48, "device": device}
             for preset in ("tiny", default):
                 rows += reconstruct.curves(preset, vary=(), **size)
-            rows += reconstruct.curves(default, vary=("samples",), iterations=200, **size)
+            rows += reconstruct.curves(default, vary=("samples",), iterations=100, **size)
         else:
             size = {"families": ("mip360", "dtu"), "device": device}
             vary = tuple(reconstruct.VARIATIONS)
@@ -115,6 +115,13 @@ def reconstruct_rows(quick: bool, data: Path | None) -> list[Row]:
                 rows += reconstruct.curves(preset, vary=vary if preset == default else (), **size)
     whole = float(PRESETS[default].iterations)
     return _marked(rows, {"preset": default, "varied": "preset", "iterations": whole})
+
+
+def geometry_rows(quick: bool, data: Path | None) -> list[Row]:
+    from flows.bench import geometry  # Open3D, which nothing else here needs
+
+    rows = [row for device in _devices() for row in geometry.rows(quick, device)]
+    return _marked(rows, {"preset": ReconstructConfig().preset})
 
 
 def kernel_rows(quick: bool, data: Path | None) -> list[Row]:
@@ -185,6 +192,11 @@ BENCHES: dict[str, Bench] = {
         (Panel("Reconstruction", "seconds", "psnr_db", ("preset", "varied"), ("setting", "iterations"),
                ("family", "device"), higher_is_better=True),),
     ),
+    "geometry": Bench(
+        "depth and mesh of the field against exact surfaces of procedural scenes",
+        geometry_rows,
+        (Panel("Geometry", "train_s", "depth_abs_rel", ("preset",), each=("family", "device")),),
+    ),
     "kernels": Bench("the hash grid query beside plain torch and the memory's floor", kernel_rows),
     "poses": Bench(
         "camera estimation by its number of image features, against the known cameras of real scenes (needs --data)",
@@ -201,7 +213,7 @@ BENCHES: dict[str, Bench] = {
         "codecs and number formats of images and latents in the scene store: size, speed, error",
         store_rows,
         (
-            Panel("Store, time and size", "ms_per_view", "bytes_per_view", ("codec",), each=("content", "source"),
+            Panel("Store, time and size", "cpu_ms_per_view", "bytes_per_view", ("codec",), each=("content", "source"),
                   where=(("store_format", True),)),
             Panel("Store, size and error", "bytes_per_view", "error", ("format",), each=("content", "source"),
                   where=(("store_codec", True),)),

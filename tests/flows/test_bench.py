@@ -12,8 +12,8 @@ import pytest
 
 from flows import bench_command
 from flows.bench import store
-from flows.bench.fronts import drawn_panels, pareto_front, verdict
-from flows.bench.page import cell, read_benches, tables, worth_showing, write_page
+from flows.bench.fronts import cell, drawn_panels, pareto_front, verdict
+from flows.bench.page import read_benches, tables, worth_showing, write_page
 from flows.bench.registry import BENCHES, Bench, MissingError, Panel
 from flows.readers.base import InputError
 from schemas.errors import StoreError
