@@ -103,6 +103,7 @@ def _sweep(scenes: list[list[dict[str, Any]]], workers: int) -> list[str]:
 def run_sweep(config: SweepConfig, out: Path) -> list[str]:
     """Do what is missing of a sweep. Returns a sentence per failure; results of the others stand."""
     from flows.report import write_report
+    from flows.sampling.ahead import sample_ahead
     from flows.server import prefect_server
 
     out = out.resolve()
@@ -115,6 +116,7 @@ def run_sweep(config: SweepConfig, out: Path) -> list[str]:
     if todo:
         runner: Any = ProcessPoolTaskRunner(config.workers)
         with prefect_server(out / ".prefect"):
+            sample_ahead([job for jobs in todo for job in jobs])
             documents = [[job.model_dump(mode="json") for job in jobs] for jobs in todo]
             problems += _sweep.with_options(task_runner=runner)(documents, config.workers)
     page = write_report(out, only_if_changed=not todo)

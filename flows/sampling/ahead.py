@@ -6,7 +6,7 @@ Done before the scenes' own flows, which then find their views there and only re
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from flows.errors import describe
 from flows.jobs import Job, expected_steps, pending
@@ -23,23 +23,31 @@ PREPARATION = ("ingest", "poses", "plan", "encode")
 def sample_ahead(jobs: Sequence[Job]) -> Totals:
     """Prepare the jobs that are to be sampled, then sample them together, with the execution settings of the first.
 
-    A job that can't be prepared is left out, with a sentence: its own flow will meet the error again and report it.
+    What fails here is said and left to the scene's own flow, which will meet the same error and report it.
     """
+    generative = [job for job in jobs if job.config.method == "cat3d"]
     with contextlib.ExitStack() as stores:
-        works = []
-        for path in dict.fromkeys(job.store_path for job in jobs if job.config.method == "cat3d"):
-            own = [job for job in jobs if job.store_path == path and job.config.method == "cat3d"]
-            try:
+        works: list[Work] = []
+        for path in dict.fromkeys(job.store_path for job in generative):
+            own = [job for job in generative if job.store_path == path]
+            with _left_to_its_flow(own[0].scene_id):
                 stores.enter_context(writing(path, own[0].scene_id))
                 works += [work for job in own if (work := prepared(job)) is not None]
-            except Exception as error:
-                sentence = describe(error)
-                if sentence is None:
-                    raise
-                console.print(f"{own[0].scene_id} is not sampled with the others: {sentence}")
-        if not works:
-            return Totals()
-        return fan_out(works, works[0].job.config.execution, f"sample {len(works)} runs")
+        if works:
+            with _left_to_its_flow(f"{len(works)} runs"):
+                return fan_out(works, works[0].job.config.execution, f"sample {len(works)} runs")
+        return Totals()
+
+
+@contextlib.contextmanager
+def _left_to_its_flow(what: str) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        sentence = describe(error)
+        if sentence is None:
+            raise
+        console.print(f"Sampling {what} together with others failed: {sentence}")
 
 
 def prepared(job: Job) -> Work | None:

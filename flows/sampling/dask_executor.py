@@ -42,6 +42,8 @@ def dask_batch(document: str, label: str) -> str:
 class DaskExecutor:
     """A cluster of its own, or a running one. Dask itself gives a dead worker's batch to another worker."""
 
+    ahead = 1  # a task's way through Prefect and Dask takes 0.1 s and more, see docs/scaling.md
+
     def __init__(self, settings: ExecutionConfig) -> None:
         self.resources = dict(settings.dask_resources)
         self.exclusive = settings.dask_address is None
@@ -52,10 +54,10 @@ class DaskExecutor:
         self.futures: dict[int, distributed.Future] = {}
         self.finished: queue.SimpleQueue[int] = queue.SimpleQueue()  # numbers of batches
 
-    def slots(self) -> int:
-        """One batch a worker, of those that have the resources; at least one, as a cluster may only be starting."""
-        workers = self.client.scheduler_info(n_workers=-1)["workers"].values()
-        able = [w for w in workers if all(w["resources"].get(n, 0) >= v for n, v in self.resources.items())]
+    def workers(self) -> int:
+        """Those that have the resources; at least one, as a cluster may only be starting."""
+        known = self.client.scheduler_info(n_workers=-1)["workers"].values()
+        able = [w for w in known if all(w["resources"].get(n, 0) >= v for n, v in self.resources.items())]
         return max(1, len(able))
 
     def submit(self, batch: Batch) -> None:

@@ -10,16 +10,21 @@ from schemas.config import ExecutionConfig
 
 
 class Executor(Protocol):
-    """Workers that take one batch at a time. `exclusive`: after `close`, none of them can be writing any more."""
+    """Workers that do one batch at a time.
 
+    ahead: batches that may wait for each worker while it is busy, where handing one out takes long.
+    exclusive: after `close`, none of the workers can be writing any more.
+    """
+
+    ahead: int
     exclusive: bool
 
-    def slots(self) -> int:
+    def workers(self) -> int:
         """Batches that can be worked on at once, as of now."""
         ...
 
     def submit(self, batch: Batch) -> None:
-        """Hand a batch out; only while fewer than `slots()` are out."""
+        """Hand a batch out; only while fewer than workers() * (1 + ahead) are out."""
         ...
 
     def answers(self, timeout_s: float) -> list[Answer]:

@@ -92,16 +92,16 @@ class _Sharing:
             self._watch()
 
     def _hand_out(self) -> None:
-        slots = self.executor.slots()
-        self.totals.workers = max(self.totals.workers, slots)
-        while len(self.out) < slots:
+        workers = self.executor.workers()
+        self.totals.workers = max(self.totals.workers, workers)
+        while len(self.out) < workers * (1 + self.executor.ahead):
             ready = [w for w in range(len(self.works)) if self._queue(w)]
             if not ready:
                 return
             # Works with most passes left first: their later passes wait for this one.
             chosen = max(ready, key=lambda w: (len(self.passes[w]), -w))
             queue = self._queue(chosen)
-            items = [queue.popleft() for _ in range(self._batch_size(len(queue), slots))]
+            items = [queue.popleft() for _ in range(self._batch_size(len(queue), workers))]
             work = self.works[chosen]
             self.number += 1
             batch = Batch(number=self.number, job=work.job, stage=work.stage, key=work.key, items=tuple(items))
@@ -115,13 +115,13 @@ class _Sharing:
             passes.popleft()
         return passes[0] if passes else deque()
 
-    def _batch_size(self, waiting: int, slots: int) -> int:
+    def _batch_size(self, waiting: int, workers: int) -> int:
         """Items of about batch_seconds, but fewer near the end, so that workers end together."""
         least = self.settings.groups_at_once
         if self.item_seconds is None:
             return min(waiting, least)
         timely = int(self.settings.batch_seconds / max(self.item_seconds, 1e-9))
-        return min(waiting, max(least, min(timely, math.ceil(waiting / (2 * slots)))))
+        return min(waiting, max(least, min(timely, math.ceil(waiting / (2 * workers)))))
 
     def _settle(self, answer: Answer) -> None:
         out = self.out.pop(answer.number, None)
@@ -145,7 +145,10 @@ class _Sharing:
         for number, out in list(self.out.items()):
             while out.left and self.works[out.work].finished(out.left[0]):
                 self._advance(out, 1)
-            if time.monotonic() - out.seen > self.settings.timeout_s:
+            if (
+                time.monotonic() - out.seen
+                > self.settings.timeout_s + self.executor.ahead * self.settings.batch_seconds
+            ):
                 self.executor.take_back(out.batch)
                 del self.out[number]
                 self._reclaim(out, f"finished nothing for {self.settings.timeout_s:g} s")

@@ -22,6 +22,7 @@ STOP_TIMEOUT_S = 5.0
 class LocalExecutor:
     """Starts workers as they are needed, and new ones for those that die. Batches and answers are lines of JSON."""
 
+    ahead = 0  # a line of JSON is there at once
     exclusive = True
 
     def __init__(self, settings: ExecutionConfig, log_folder: Path) -> None:
@@ -29,16 +30,16 @@ class LocalExecutor:
         self.count = settings.workers or len(self.gpus) or max(1, len(os.sched_getaffinity(0)) // settings.threads)
         self.threads = settings.threads
         self.log_folder = log_folder
-        self.workers: dict[int, _Worker] = {}  # by place, 0 to count - 1
+        self.running: dict[int, _Worker] = {}  # by place, 0 to count - 1
         self.selector = selectors.DefaultSelector()
         log_folder.mkdir(parents=True, exist_ok=True)
 
-    def slots(self) -> int:
+    def workers(self) -> int:
         return self.count
 
     def submit(self, batch: Batch) -> None:
-        idle = [w for w in self.workers.values() if w.batch is None]
-        worker = idle[0] if idle else self._start(next(p for p in range(self.count) if p not in self.workers))
+        idle = [w for w in self.running.values() if w.batch is None]
+        worker = idle[0] if idle else self._start(next(p for p in range(self.count) if p not in self.running))
         worker.batch = batch.number
         with contextlib.suppress(BrokenPipeError):  # it has just died, which `answers` will see
             worker.stdin.write(batch.model_dump_json().encode() + b"\n")
@@ -59,12 +60,12 @@ class LocalExecutor:
         return out
 
     def take_back(self, batch: Batch) -> None:
-        for worker in list(self.workers.values()):
+        for worker in list(self.running.values()):
             if worker.batch == batch.number:
                 self._end(worker)
 
     def close(self) -> None:
-        for worker in list(self.workers.values()):
+        for worker in list(self.running.values()):
             self._end(worker)
         self.selector.close()
 
@@ -73,14 +74,14 @@ class LocalExecutor:
         if self.gpus:
             environment["CUDA_VISIBLE_DEVICES"] = self.gpus[place % len(self.gpus)]
         worker = _Worker(place, self.log_folder / f"worker-{place}.log", environment)
-        self.workers[place] = worker
+        self.running[place] = worker
         self.selector.register(worker.stdout, selectors.EVENT_READ, worker)
         return worker
 
     def _end(self, worker: _Worker) -> int:
         """Make sure the worker is gone; its exit code. It needs no warning: the store is whole at every moment."""
         self.selector.unregister(worker.stdout)
-        del self.workers[worker.place]
+        del self.running[worker.place]
         worker.process.kill()
         code = worker.process.wait()
         for pipe in (worker.stdin, worker.stdout):
