@@ -52,8 +52,8 @@ def draw_images(renders: Tensor, photos: Tensor | None, count: int, random: torc
 @torch.no_grad()
 def reconstruction_psnr(autoencoder: Autoencoder, images: Tensor) -> float:
     """Mean PSNR in dB over images (B, 3, H, W)."""
-    decoded = autoencoder.decode(autoencoder.encode(images))
-    return float((-10 * (decoded - images.float()).square().mean((1, 2, 3)).log10()).mean())
+    errors = [(autoencoder.decode(autoencoder.encode(i)) - i).square().mean((1, 2, 3)) for i in images.split(16)]
+    return float((-10 * torch.cat(errors).log10()).mean())
 
 
 def train_autoencoder(
@@ -91,7 +91,8 @@ def train_autoencoder(
         step += 1
         passed = (time.monotonic() - start) / seconds
         report(min(passed, 1.0), step, record["psnr"])
-    model.calibrate(draw_images(renders, photos, 512, generator(seed, "calibration")).to(device))
+    enough = max(16, min(512, 2**23 // renders[0, 0].numel()))  # they pass through the encoder at once
+    model.calibrate(draw_images(renders, photos, enough, generator(seed, "calibration")).to(device))
     return model.cpu().eval().requires_grad_(False)
 
 

@@ -183,6 +183,6 @@ def write_samples(config: TrainRunConfig, folder: Path, trainer: Trainer, scenes
     name, given = f"step_{trainer.steps:08d}", max(config.conditions)
     if (folder / SHEETS / f"{name}.png").exists():
         return
-    images = sampled(trainer.ema_model(), scenes, given, config.sample_steps)
+    images = sampled(trainer.ema_model().to(trainer.device), scenes, given, config.sample_steps)
     append_rows(folder / SHEETS, SAMPLES, scores(images, scenes, given, trainer.steps), name)
     write_sheet(folder / SHEETS / f"{name}.png", images, scenes, given)

@@ -39,7 +39,8 @@ def prepare(config: TrainRunConfig, network: ModelConfig, folder: Path, own: Ran
         claim(folder / "bank.json", _identity(config, network))
     own.barrier()
     mine = renders.shard_numbers(bank.scenes)[own.rank :: own.world]
-    photos = read_photos(bank.textures) if bank.textures else None
+    complete = len(renders.shards(folder, "latents")) == len(renders.shard_numbers(bank.scenes))
+    photos = read_photos(bank.textures) if bank.textures and not complete else None
     scenes = sum(min(renders.SHARD_SCENES, bank.scenes - n * renders.SHARD_SCENES) for n in mine)
     with meter("render scenes", scenes) as bar:
         renders.render_shards(

@@ -39,10 +39,12 @@ def held_out(families: Sequence[str], scenes: int, size: int, views: int) -> Hel
 
 @torch.no_grad()
 def sampled(model: MultiViewModel, scenes: HeldOut, given: int, steps: int) -> Tensor:
-    """Images (G, V - given, 3, H, W) of the target views, given the first `given`; noise keyed by group and view.
+    """Images (G, V - given, 3, H, W) of the target views, on the CPU, given the first `given`; noise keyed by group
+    and view.
 
     Targets beyond the model's group are sampled in further groups, so that models of other views can be compared."""
-    latents = model.autoencoder.encode(scenes.images.flatten(0, 1)).unflatten(0, scenes.images.shape[:2])
+    device = next(model.parameters()).device
+    latents = torch.stack([model.autoencoder.encode(images.to(device)) for images in scenes.images])
     height, width = latents.shape[-2:]
     rays = torch.stack([raymap(c, c.world_from_camera[0], height, width).float() for c in scenes.cameras])
     noise = torch.stack(
@@ -51,7 +53,8 @@ def sampled(model: MultiViewModel, scenes: HeldOut, given: int, steps: int) -> T
             for group in range(len(latents))
         ]
     )
-    config = SamplerConfig(steps=steps, guidance=GuidanceConfig(scale=1.0))
+    rays, noise = rays.to(device), noise.to(device)
+    config = SamplerConfig(steps=steps, guidance=GuidanceConfig(scale=1.0), micro_batch=min(len(latents), 8))
     at_once = model.config.views - given
     parts = []
     for first in range(0, noise.shape[1], at_once):
@@ -59,7 +62,7 @@ def sampled(model: MultiViewModel, scenes: HeldOut, given: int, steps: int) -> T
         seen = torch.cat([rays[:, :given], rays[:, targets]], 1)
         parts.append(sample(model, latents[:, :given], seen, noise[:, first : first + at_once], config))
     out = torch.cat(parts, 1)
-    return model.autoencoder.decode(out.flatten(0, 1)).unflatten(0, out.shape[:2])
+    return torch.stack([model.autoencoder.decode(group) for group in out]).cpu()
 
 
 def scores(images: Tensor, scenes: HeldOut, given: int, step: int) -> list[dict[str, Any]]:
