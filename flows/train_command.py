@@ -15,7 +15,7 @@ from cat3d_core.diffusion import count_parameters
 from flows.progress import console
 from flows.readers.base import InputError
 from flows.run_command import settings_document
-from flows.training.loop import MODEL, SHEETS, TABLES, train
+from flows.training.loop import MODEL, SHEETS, STATE, TABLES, train
 from flows.training.model import model_config, starting_config, starting_model
 from flows.training.prepare import claim, prepare
 from flows.training.ranks import Ranks, ranks
@@ -29,10 +29,9 @@ from schemas.training import SAMPLES, TRAINING, TrainRunConfig
 PRESETS = Path(__file__).parent / "training" / "presets"
 RECORD = "training.json"
 #: Settings that may change between the legs of one training.
-FREE = frozenset({"name", "note", "steps", "minutes", "device", "log_steps", "save_minutes", "sample_minutes"}) | {
-    "sample_scenes",
-    "sample_steps",
-}
+FREE = {"name", "note", "steps", "minutes", "device"} | {
+    "log_steps", "save_minutes", "sample_minutes", "sample_scenes", "sample_steps",
+}  # fmt: skip
 
 
 def train_command(config: str, out: Path, given: dict[str, Any], settings: Sequence[str], list_presets: bool) -> None:
@@ -70,7 +69,8 @@ def run_training(config: TrainRunConfig, out: Path, own: Ranks) -> None:
     started = time.monotonic()
     network = starting_config(model_config(**config.model.model_dump()), config.start)
     if own.first:
-        claim(out / RECORD, json.loads(config.model_dump_json()), FREE)
+        document = json.loads(config.model_dump_json())
+        claim(out / RECORD, document, set(document) - FREE if (out / STATE).exists() else ())
     own.barrier()
     million = count_parameters(network.unet) / 1e6
     console.print(

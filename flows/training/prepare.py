@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,9 @@ def prepare(config: TrainRunConfig, network: ModelConfig, folder: Path, own: Ran
             "fewer scenes, views or variants, or allow more."
         )
     if own.first:
-        claim(folder / "bank.json", _identity(config, network))
+        made = {"bank", "image_size", "seed"} if renders.shards(folder, "renders") else set()
+        made |= {"network", "autoencoder"} if (folder / AUTOENCODER).exists() else set()
+        claim(folder / "bank.json", _identity(config, network), made)
     own.barrier()
     mine = renders.shard_numbers(bank.scenes)[own.rank :: own.world]
     complete = len(renders.shards(folder, "latents")) == len(renders.shard_numbers(bank.scenes))
@@ -65,12 +68,12 @@ def _identity(config: TrainRunConfig, network: ModelConfig) -> dict[str, Any]:
             "autoencoder": wanted}  # fmt: skip
 
 
-def claim(path: Path, document: dict[str, Any], free: frozenset[str] = frozenset()) -> None:
-    """Record in `path` what its folder holds. Raises ConfigError if it holds something else; entries in `free` may
-    differ."""
+def claim(path: Path, document: dict[str, Any], binding: Collection[str]) -> None:
+    """Record in `path` what its folder holds. Raises ConfigError if an entry of those in `binding`, on which something
+    in the folder depends already, is another one."""
     if path.exists():
         earlier = json.loads(path.read_text())
-        changed = [name for name in document if name not in free and document[name] != earlier.get(name)]
+        changed = [name for name in document if name in binding and document[name] != earlier.get(name)]
         if changed:
             raise ConfigError(
                 f"{path} belongs to a training with other settings ({', '.join(changed)}); go on with the same, or "

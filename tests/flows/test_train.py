@@ -211,6 +211,16 @@ def test_a_folder_of_another_training_is_refused(trained: Path, config: Path, tm
         train_command(str(config), tmp_path, {}, [bank, "bank.scenes=6"], False)
 
 
+def test_a_folder_is_bound_only_by_what_is_in_it(trained: Path, config: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="There is no model file"):
+        train_command(
+            str(config), tmp_path, {"autoencoder": {"path": "/nowhere.safetensors"}}, ["bank.scenes=2"], False
+        )
+    good = {"steps": 1, "autoencoder": {"path": str(trained / "bank" / "autoencoder.safetensors")}}
+    train_command(str(config), tmp_path, good, ["bank.scenes=2"], False)
+    assert describe(tmp_path / "model.safetensors")["provenance"]["steps"] == 1
+
+
 def test_neither_file_nor_preset() -> None:
     with pytest.raises(InputError, match="shipped are ablation_3.1, .*recipe_10_minutes"):
         training_config("nonsense", {}, [])
