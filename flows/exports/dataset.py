@@ -31,7 +31,7 @@ def write_dataset(
             f"View {skewed[0]} has skewed pixels, which nerfstudio and COLMAP pinhole cameras cannot have."
         )
     kinds = ["generated" if name is None else "captured" for name in captured_name]
-    names = [f"{kind}_{i:04d}.png" for i, kind in enumerate(kinds)]
+    names = [f"{kind}_{kinds[:i].count(kind):04d}.png" for i, kind in enumerate(kinds)]
     (folder / "images").mkdir(parents=True, exist_ok=True)
     for name, image in zip(names, images, strict=True):
         write_png(folder / "images" / name, image)

@@ -136,7 +136,7 @@ def write_mesh_glb(path: Path, mesh: Mesh) -> None:
     x = mesh.colours / 255
     linear = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
     colours = (linear * 255 + 0.5).astype(np.uint8)
-    exported = trimesh.Trimesh(
+    shape = trimesh.Trimesh(
         mesh.vertices, mesh.faces, vertex_normals=mesh.normals, vertex_colors=colours, process=False
-    ).export(file_type="glb")
-    write_bytes(path, exported)
+    )
+    write_bytes(path, trimesh.exchange.gltf.export_glb(trimesh.Scene(shape)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -57,7 +58,8 @@ def _read_field(store: SceneStore, run: Run) -> Field:
     settings = record.inputs["trainer"]
     state = {name: torch.from_numpy(run.field.read(name)) for name in run.field.attrs["parameters"]}
     try:
-        config = ReconstructConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()})
+        values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
+        config = ReconstructConfig(**values)
         field = Field.from_state(config, state)
     except (TypeError, ValueError) as error:
         raise InputError(
