@@ -29,9 +29,12 @@ def run(
         str, typer.Option(help="Training views: counts with a split of the data set, or all; several by commas.")
     ] = "all",
     downscale: Annotated[float, typer.Option(help="Divide image width and height by this.")] = 1,
-    method: Annotated[str, typer.Option(help="zipnerf: captured views only; cat3d: with generated views.")] = "zipnerf",
+    method: Annotated[
+        str, typer.Option(help="zipnerf: captured views only; cat3d: with generated views; auto: cat3d for one photo.")
+    ] = "auto",
     preset: Annotated[str, typer.Option(help="reconstruction preset: tiny, fast, balanced, paper.")] = "fast",
     seed: Annotated[int, typer.Option(help="All randomness follows from it.")] = 0,
+    model: Annotated[Path | None, typer.Option(help="Diffusion model file instead of the shipped one.")] = None,
     reader: Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")] = "auto",
     images: Annotated[str | None, typer.Option(help="Image folder inside the scene, where there are several.")] = None,
     config: Annotated[Path | None, typer.Option(help="Settings from a YAML or JSON file; options here win.")] = None,
@@ -43,6 +46,8 @@ def run(
     from flows.run_command import run_command
 
     given = {"downscale": downscale, "method": method, "preset": preset, "seed": seed}
+    if model is not None:
+        given["model"] = str(model.resolve())
     run_command(source, out, views.split(","), given, reader, images, config, set_ or [])
 
 
@@ -242,6 +247,7 @@ def main() -> None:
     # Before torch and Prefect are imported: no busy-waiting threads on shared machines, no log lines between ours.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("PREFECT_LOGGING_LEVEL", "CRITICAL")
+    os.environ.setdefault("PREFECT_LOGGING_INTERNAL_LEVEL", "CRITICAL")
     from flows.errors import describe
 
     try:
