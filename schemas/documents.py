@@ -27,8 +27,18 @@ from schemas.errors import MissingError, StoreError
 SEAL = "document_sha256"
 #: Entries that a `zarr.json` may have.
 KEYS = {
-    "zarr_format", "node_type", "attributes", "consolidated_metadata", "shape", "data_type", "chunk_grid",
-    "chunk_key_encoding", "fill_value", "codecs", "storage_transformers", "dimension_names",
+    "zarr_format",
+    "node_type",
+    "attributes",
+    "consolidated_metadata",
+    "shape",
+    "data_type",
+    "chunk_grid",
+    "chunk_key_encoding",
+    "fill_value",
+    "codecs",
+    "storage_transformers",
+    "dimension_names",
 }
 
 

@@ -54,8 +54,11 @@ class SceneStore(Section):
         """Make an empty store, complete or not at all. Raises StoreError if there is something at `path` already."""
         path = Path(path)
         attributes = {
-            "format": FORMAT, "schema_version": SCHEMA_VERSION,
-            "scene_id": checked_name(scene_id), "dataset": dataset, "provenance": provenance,
+            "format": FORMAT,
+            "schema_version": SCHEMA_VERSION,
+            "scene_id": checked_name(scene_id),
+            "dataset": dataset,
+            "provenance": provenance,
         }
         empty = not path.exists() or (path.is_dir() and not any(path.iterdir()))
         if not empty or not make_tree(path, attributes, GROUPS):

@@ -58,8 +58,8 @@ class Schedule:
         table, count = self.log_snr, self.config.steps
         if steps > count and kind in ("trailing", "linspace"):
             raise ValueError(
-                f"{kind!r} nodes are entries of a table of {count} steps, so there can't be {steps} different ones; use "
-                "'log_snr' or 'karras' nodes."
+                f"{kind!r} nodes are entries of a table of {count} steps, so there can't be {steps} different ones; "
+                "use 'log_snr' or 'karras' nodes."
             )
         if kind == "trailing":
             index = torch.arange(steps, dtype=torch.float64) * (-count / steps) + count

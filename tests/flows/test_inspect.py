@@ -128,8 +128,16 @@ def test_the_text_names_every_array_stage_and_problem(store: SceneStore) -> None
     console.print(as_text(report))
     text = console.export_text()
     for part in (
-        "scene fox of nerfstudio", "captured/", "world_from_camera", "3x40x60x3", "zstd+bitshuffle", "2/4",
-        "stale: its", "2 of 60x40, 1 of 60x20 px", "corrupted: View 1 of", "damage was found",
+        "scene fox of nerfstudio",
+        "captured/",
+        "world_from_camera",
+        "3x40x60x3",
+        "zstd+bitshuffle",
+        "2/4",
+        "stale: its",
+        "2 of 60x40, 1 of 60x20 px",
+        "corrupted: View 1 of",
+        "damage was found",
     ):
         assert part in text, part
 

@@ -56,9 +56,9 @@ def test_the_users_server_is_used_and_a_missing_one_is_named(tmp_path: Path, mon
     monkeypatch.setenv("PREFECT_API_URL", "http://127.0.0.1:9/api")
     wait = server._wait_until_healthy
     monkeypatch.setattr(server, "_wait_until_healthy", lambda url, process, timeout: wait(url, process, 0.5))
-    with pytest.raises(ServerError, match="No Prefect server answered at http://127.0.0.1:9/api"):
-        with prefect_server(tmp_path):
-            pass
+    missing = pytest.raises(ServerError, match="No Prefect server answered at http://127.0.0.1:9/api")
+    with missing, prefect_server(tmp_path):
+        pass
     assert not (tmp_path / "prefect.db").exists()
 
 

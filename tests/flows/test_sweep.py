@@ -45,8 +45,8 @@ def dataset(tmp_path: Path) -> Path:
         pose = capture.cameras.world_from_camera[i] @ torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
         frames.append({"file_path": f"images/{name}.png", "transform_matrix": pose.tolist()})
     k = capture.cameras.intrinsics[0]
-    document = {"fl_x": float(k[0, 0]), "fl_y": float(k[1, 1]), "cx": float(k[0, 2]), "cy": float(k[1, 2]), "w": 24, "h": 20,
-                "frames": frames}  # fmt: skip
+    lens = {"fl_x": float(k[0, 0]), "fl_y": float(k[1, 1]), "cx": float(k[0, 2]), "cy": float(k[1, 2])}
+    document = lens | {"w": 24, "h": 20, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(document))
     (folder / "train_test_split_3.json").write_text(json.dumps({"train_ids": [0, 2, 4], "test_ids": [1, 5]}))
     return folder
