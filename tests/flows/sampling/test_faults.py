@@ -67,6 +67,7 @@ def test_a_killed_workers_groups_are_taken_over(scene, expected) -> None:
     assert workers_of(os.getpid()) == []
 
 
+@pytest.mark.slow
 def test_a_hanging_worker_is_given_up_and_its_groups_are_taken_over(scene, expected) -> None:
     job = scene(workers=1, timeout_s=25)
     with Trouble(job, signal.SIGSTOP) as trouble:
@@ -104,7 +105,7 @@ def wait_for(condition: Callable[[], object], timeout_s: float = 60) -> None:
         time.sleep(0.02)
 
 
-@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("kind", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)])
 def test_the_workers_end_with_their_parent_and_the_next_run_goes_on(scene, expected, kind) -> None:
     job = scene(workers=2)
     process = start(job)
