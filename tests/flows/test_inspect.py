@@ -163,7 +163,7 @@ def _rewrite(path: str) -> None:
 
 def test_a_store_is_inspected_while_it_is_rewritten(store: SceneStore) -> None:
     store.invalidate("ingest")
-    writer = mp.get_context("fork").Process(target=_rewrite, args=(str(store.root),))
+    writer = mp.get_context("forkserver").Process(target=_rewrite, args=(str(store.root),))
     writer.start()
     looks = 0
     while writer.is_alive() or looks == 0:

@@ -16,7 +16,9 @@ from schemas.scene_store import SceneStore
 from schemas.verify import verify
 
 VIEWS, SHAPE = 60, (4, 16, 16)
-CONTEXT = mp.get_context("fork")
+# Children come from a clean server process: forking this one would copy whatever threads other tests have started.
+CONTEXT = mp.get_context("forkserver")
+CONTEXT.set_forkserver_preload(["schemas.scene_store", "schemas.verify"])
 
 
 def latent(view: int) -> np.ndarray:
