@@ -94,7 +94,7 @@ class SampleConfig(_Model):
     """Solver of the probability-flow ODE (paper: ddim)."""
     nodes: Literal["trailing", "linspace", "log_snr", "karras"] | None = None
     """Spacing of the noise levels (paper: trailing)."""
-    steps: Annotated[int, Field(ge=3)] | None = None
+    steps: Annotated[int, Field(ge=1)] | None = None
     """Sampler steps (paper: 50)."""
     guidance: NonNegativeFloat | None = None
     """Classifier-free guidance weight."""

@@ -126,7 +126,7 @@ class TrainRunConfig(_Model):
     """Between sample sheets; the last is made at the end."""
     sample_scenes: PositiveInt = 1
     """Held-out scenes of each family on a sheet."""
-    sample_steps: Annotated[int, Field(ge=3)] = 20
+    sample_steps: Annotated[int, Field(ge=1)] = 20
     """Sampler steps of a sheet."""
 
     @model_validator(mode="after")

@@ -51,10 +51,12 @@ class Schedule:
 
         trailing: steps T-1, T-1-T/n, ... (Lin et al. 2023); linspace: from step T-1 to 0; log_snr: uniform in log-SNR
         over the table's range; karras: uniform in (sigma/alpha)^(1/7) (Karras et al. 2022). The last three end at step
-        0.
+        0, which takes 3 nodes at least; one or two steps are trailing ones whatever the kind.
         """
+        if steps < 1:
+            raise ValueError(f"Sampling needs at least 1 step, not {steps}.")
         if steps < 3:
-            raise ValueError(f"Sampling needs at least 3 steps, not {steps}.")
+            kind = "trailing"
         table, count = self.log_snr, self.config.steps
         if steps > count and kind in ("trailing", "linspace"):
             raise ValueError(
