@@ -54,7 +54,7 @@ class Schedule:
         0, which takes 3 nodes at least; one or two steps are trailing ones whatever the kind.
         """
         if steps < 1:
-            raise ValueError(f"Sampling needs at least 1 step, not {steps}.")
+            raise ValueError(f"The number of steps is {steps}; sampling needs at least one.")
         if steps < 3:
             kind = "trailing"
         table, count = self.log_snr, self.config.steps
