@@ -29,6 +29,8 @@ from schemas.errors import ConfigError
 os.environ.setdefault("DASK_LOGGING__DISTRIBUTED", "critical")
 logging.getLogger("distributed").setLevel(logging.CRITICAL)
 
+RESTART_TIMEOUT_S = 5
+
 
 @task(name="cat3d-batch", task_run_name="{label}", cache_policy=NO_CACHE, persist_result=False)
 def dask_batch(document: str, label: str) -> str:
@@ -78,12 +80,15 @@ class DaskExecutor:
                 number = self.finished.get_nowait()
         return out
 
-    def take_back(self, batch: Batch) -> None:
+    def take_back(self, batch: Batch) -> list[int]:
         future = self.futures.pop(batch.number)
-        holders = [address for address, keys in self.client.processing().items() if future.key in keys]
+        holders = {address: keys for address, keys in self.client.processing().items() if future.key in keys}
         future.cancel(force=True)
         if holders:
-            self.client.restart_workers(holders, timeout=60, raise_for_error=False)
+            # A hanging process does not end by itself: after most of the timeout its nanny kills it.
+            self.client.restart_workers(list(holders), timeout=RESTART_TIMEOUT_S, raise_for_error=False)
+        waiting = {key for keys in holders.values() for key in keys}
+        return [number for number, other in self.futures.items() if other.key in waiting]
 
     def close(self) -> None:
         for future in self.futures.values():

@@ -31,8 +31,11 @@ class Executor(Protocol):
         """What came back, waiting at most timeout_s for something to come."""
         ...
 
-    def take_back(self, batch: Batch) -> None:
-        """Give up the worker that has this batch, hanging as it may be; no answer to it will count."""
+    def take_back(self, batch: Batch) -> list[int]:
+        """Give up the worker that has this batch, hanging as it may be; no answer to it will count.
+
+        Returns the numbers of other batches that waited there: they go on elsewhere by themselves.
+        """
         ...
 
     def close(self) -> None:

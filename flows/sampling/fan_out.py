@@ -142,14 +142,14 @@ class _Sharing:
         started = time.monotonic()
         if started < self.next_watch:
             return
+        # A batch that waits behind another has no chance to finish anything.
+        patience_s = self.settings.timeout_s + self.executor.ahead * self.settings.batch_seconds
         for number, out in list(self.out.items()):
             while out.left and self.works[out.work].finished(out.left[0]):
                 self._advance(out, 1)
-            if (
-                time.monotonic() - out.seen
-                > self.settings.timeout_s + self.executor.ahead * self.settings.batch_seconds
-            ):
-                self.executor.take_back(out.batch)
+            if time.monotonic() - out.seen > patience_s:
+                for other in self.executor.take_back(out.batch):
+                    self.out[other].seen = time.monotonic()
                 del self.out[number]
                 self._reclaim(out, f"finished nothing for {self.settings.timeout_s:g} s")
         ended = time.monotonic()
