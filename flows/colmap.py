@@ -1,24 +1,19 @@
-"""pycolmap, without the handlers its logging library puts on SIGTERM and others when it is imported.
+"""pycolmap, without the handler its logging library puts on SIGTERM when it is imported.
 
-They print a C++ stack trace and end the process before any `finally`; here the handlers that were there stay.
+That one prints a C++ stack trace and ends the process before any `finally`; here the handler that was there stays.
 `from flows.colmap import pycolmap` instead of importing it.
 """
 
 from __future__ import annotations
 
 import contextlib
-import faulthandler
 import signal
 
-_TAKEN = (signal.SIGTERM, signal.SIGABRT, signal.SIGSEGV, signal.SIGILL, signal.SIGFPE, signal.SIGBUS)
-_before = {number: signal.getsignal(number) for number in _TAKEN}
+_before = signal.getsignal(signal.SIGTERM)
 
 import pycolmap  # noqa: E402
 
-for _number, _handler in _before.items():
-    with contextlib.suppress(ValueError, TypeError):  # ValueError: not in the main thread, which handles signals
-        signal.signal(_number, _handler)
-if faulthandler.is_enabled():
-    faulthandler.enable()
+with contextlib.suppress(ValueError, TypeError):  # ValueError: not in the main thread, which handles signals
+    signal.signal(signal.SIGTERM, _before)
 
 __all__ = ["pycolmap"]
