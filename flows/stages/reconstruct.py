@@ -71,7 +71,8 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     smallest = int(views.size.min())
     if config.patch_size > smallest:
         config = dataclasses.replace(config, patch_size=smallest)
-        decisions.append(f"LPIPS patches are {smallest} pixels, the shorter side of the smallest view.")
+        if config.lpips_weight > 0:
+            decisions.append(f"LPIPS patches are {smallest} pixels, the shorter side of the smallest view.")
     perceptual = find_perceptual() if config.lpips_weight > 0 else None
     if perceptual is None and config.lpips_weight > 0:
         decisions.append("No perceptual network was found on this machine: trained without the LPIPS loss.")
