@@ -18,10 +18,10 @@ demo: setup
 	$(BIN)/cat3d demo --out $(DEMO_OUT) $(DEMO_ARGS)
 
 test: setup
-	OMP_NUM_THREADS=2 $(BIN)/python -m pytest -m "not slow" -q
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -q
 
 test-slow: setup
-	OMP_NUM_THREADS=2 $(BIN)/python -m pytest -m slow -q --timeout 1500
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow -q --timeout 1500
 
 lint: setup
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy

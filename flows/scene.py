@@ -73,7 +73,7 @@ def execute_stage(job: Job, step: Step) -> StageRecord:
     """Do the work of a stage, then record it: data first, record last. Plain Python, no Prefect needed."""
     store = SceneStore.open(job.store_path, "r+")
     # Taken back before the data changes: a kill in between must not leave a record of what is no longer there.
-    store.invalidate(step.stage, job.run)
+    store.forget(step.stage, job.run)
     module = importlib.import_module(f"flows.stages.{step.stage}")
     started_at, started = now(), time.monotonic()
     outcome = module.execute(job, store, step.key)

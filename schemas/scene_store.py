@@ -154,6 +154,12 @@ class SceneStore(Section):
                     removed.append(name if owner is None else f"{owner}/{name}")
         return removed[::-1]
 
+    def forget(self, stage: str, run: str | None = None) -> bool:
+        """Take back the record of this stage alone, before its data changes. Later stages whose keys cover the new
+        result become stale by their keys; runs that don't read it keep theirs. Returns whether there was a record."""
+        self._check_writable()
+        return remove_record(self._stages(stage, run), stage)
+
     def sweep(self) -> list[str]:
         """Remove what killed writers left behind (`*.partial`). Only while nobody writes. Returns what was removed."""
         self._check_writable()

@@ -203,3 +203,17 @@ def test_open_jobs_is_empty_only_when_everything_is_stored(processed: tuple[Path
     assert open_jobs(scenes[0]) == []
     shutil.rmtree(out / "room.zarr")
     assert open_jobs(scenes[0]) == scenes[0]
+
+
+def test_runs_of_one_scene_do_not_undo_each_other(tmp_path: Path, prefect_url: str) -> None:
+    """Found in the demo: encoding for the second method took back the records of the first one's later stages."""
+    from cat3d_core.diffusion import SIZES, MultiViewModel, save_model
+
+    model = tmp_path / "tiny.safetensors"
+    save_model(model, MultiViewModel(SIZES["tiny"]), {})
+    generated = {"method": "cat3d", "plan": {"views": 3}, "sample": {"checkpoint": str(model), "steps": 2}}
+    methods = {"zipnerf": {"method": "zipnerf"}, "cat3d": generated}
+    config = sweep_of("procedural:llff/2?views=6&width=24&height=20", methods=methods)
+    assert run_sweep(config, tmp_path / "out") == []
+    scenes, _ = sweep_jobs(config, tmp_path / "out")
+    assert open_jobs(scenes[0]) == []
