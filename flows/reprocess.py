@@ -57,7 +57,7 @@ def find_stale(
     """
     from fnmatch import fnmatchcase
 
-    from schemas.config import RunConfig, merged
+    from schemas.config import merged
 
     if not any(out.glob("*.zarr")):
         raise InputError(f"{out} holds no scene stores; give the --out folder of an earlier run or sweep.")
@@ -73,7 +73,6 @@ def find_stale(
             if changes:
                 document = document | {"config": merged(document["config"], changes)}
             job = Job.model_validate(document | {"out": str(out)})
-            RunConfig.model_validate(job.config.model_dump())
             values = {"scene": job.scene_id, "dataset": job.dataset, "method": job.label, "run": name,
                       "seed": str(job.config.seed)}  # fmt: skip
             wanted = all(fnmatchcase(values[f], p) for f, p in (where or {}).items())
