@@ -15,7 +15,7 @@ def mean_squared_error(prediction: Tensor, target: Tensor, mask: Tensor | None =
     Squares are float32 for float32 images (relative error about 1e-7; differences below 1e-22 count as none).
     """
     prediction, target, mask = image_pair(prediction, target, mask)
-    squared = (prediction - target).square()
+    squared = (prediction - target).square_()
     if mask is None:
         return squared.mean(dim=(1, 2, 3)).double()
     weight = mask.double()

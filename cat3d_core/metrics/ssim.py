@@ -41,7 +41,8 @@ class Window:
         return count / (count - 1) if self.bessel else 1.0
 
 
-_CHUNK = 1 << 20  # values of a batch that are worked on at a time
+_TILE = 3 << 16  # values of each image worked on at a time, so that they stay in a processor's cache
+_TILE_ROWS = 16  # at least: neighbouring tiles share a window's worth of rows
 
 
 def _gaussian_taps(count: int = 11, sigma: float = 1.5) -> tuple[float, ...]:
@@ -60,19 +61,57 @@ WINDOWS: dict[str, Window] = {
 
 
 def _local_mean(images: Tensor, taps: tuple[float, ...]) -> Tensor:
-    """(..., h, w) -> (..., h - k + 1, w - k + 1), by a symmetric window of k taps along each axis.
+    """(..., h, w) -> (..., h - k + 1, w - k + 1), by a window of k taps along each axis.
 
-    Sums of shifted slices: for a few planes several times faster on a CPU than a convolution.
+    Shifted slices added into one sum: on a CPU several times faster than a convolution, and than anything that needs
+    more temporaries.
     """
-    half = len(taps) // 2
     for axis in (-2, -1):
-        length = images.shape[axis] - 2 * half
-        total = images.narrow(axis, half, length) * taps[half]
-        for i in range(half):
-            pair = images.narrow(axis, i, length) + images.narrow(axis, 2 * half - i, length)
-            total.add_(pair, alpha=taps[i])
+        length = images.shape[axis] - len(taps) + 1
+        total = images.narrow(axis, 0, length) * taps[0]
+        for i, tap in enumerate(taps[1:], 1):
+            total.add_(images.narrow(axis, i, length), alpha=tap)
         images = total
     return images
+
+
+def _check_size(images: Tensor, window: str) -> None:
+    if window not in WINDOWS:
+        raise ValueError(f"There is no SSIM window '{window}'; choose one of {', '.join(WINDOWS)}.")
+    size, (height, width) = len(WINDOWS[window].taps), images.shape[2:]
+    if not WINDOWS[window].zero_padded and min(height, width) < size:
+        raise ValueError(
+            f"SSIM '{window}' needs at least {size}x{size} pixels; these images are {width}x{height} (width x height)."
+        )
+
+
+def _padded(images: Tensor, window: Window) -> Tensor:
+    return F.pad(images, (len(window.taps) // 2,) * 4) if window.zero_padded else images
+
+
+def _moments(field: Tensor, taps: tuple[float, ...]) -> tuple[Tensor, Tensor]:
+    """Square of the local mean, and local variance."""
+    # Variance does not depend on the origin; measured from the image's mean the cancellation is least.
+    origin = field.detach().mean(dim=(-2, -1), keepdim=True)
+    field.sub_(origin)
+    mean = _local_mean(field, taps)
+    variance = torch.addcmul(_local_mean(field.square(), taps), mean, mean, value=-1.0)
+    return (mean + origin).square_(), variance.clamp_min_(0.0)
+
+
+def _similarity(of_sum: Tensor, of_difference: Tensor, constant: float) -> Tensor:
+    """(S - D + 2 c) / (S + D + 2 c), written 1 - 2 D / (S + D + 2 c): exactly 1 where D is 0."""
+    one = torch.ones((), dtype=of_sum.dtype, device=of_sum.device)
+    return torch.addcdiv(one, of_difference, (of_sum + of_difference).add_(2 * constant), value=-2.0)
+
+
+def _local_ssim(prediction: Tensor, target: Tensor, window: Window, data_range: float) -> Tensor:
+    """(B, C, h, w) pair -> (B, C, h - k + 1, w - k + 1) float64: the windows inside."""
+    prediction, target = prediction.double(), target.double()
+    mean_sum, var_sum = _moments(prediction + target, window.taps)
+    mean_difference, var_difference = _moments(prediction - target, window.taps)
+    luminance = _similarity(mean_sum, mean_difference, (0.01 * data_range) ** 2)
+    return luminance.mul_(_similarity(var_sum, var_difference, (0.03 * data_range) ** 2 / window.variance_scale))
 
 
 def ssim_map(prediction: Tensor, target: Tensor, window: str = "gaussian_valid", data_range: float = 1.0) -> Tensor:
@@ -84,34 +123,9 @@ def ssim_map(prediction: Tensor, target: Tensor, window: str = "gaussian_valid",
     than the window, or for an unknown window.
     """
     prediction, target, _ = image_pair(prediction, target)
-    if window not in WINDOWS:
-        raise ValueError(f"There is no SSIM window '{window}'; choose one of {', '.join(WINDOWS)}.")
+    _check_size(prediction, window)
     shape = WINDOWS[window]
-    size = len(shape.taps)
-    if not shape.zero_padded and min(prediction.shape[2:]) < size:
-        height, width = prediction.shape[2:]
-        raise ValueError(
-            f"SSIM '{window}' needs at least {size}x{size} pixels; these images are {width}x{height} (width x height)."
-        )
-    prediction, target = prediction.double(), target.double()
-    c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
-
-    def moments(images: Tensor) -> tuple[Tensor, Tensor]:
-        if shape.zero_padded:
-            images = F.pad(images, (size // 2,) * 4)
-        # Variance does not depend on the origin; measured from the image's mean the cancellation is least.
-        origin = images.detach().mean(dim=(2, 3), keepdim=True)
-        centred = images - origin
-        mean = _local_mean(centred, shape.taps)
-        variance = (_local_mean(centred.square(), shape.taps) - mean.square()).clamp_min(0.0)
-        return mean + origin, variance * shape.variance_scale
-
-    mean_sum, var_sum = moments(prediction + target)
-    mean_difference, var_difference = moments(prediction - target)
-    mean_sum, mean_difference = mean_sum.square(), mean_difference.square()
-    luminance = (mean_sum - mean_difference + 2 * c1) / (mean_sum + mean_difference + 2 * c1)
-    structure = (var_sum - var_difference + 2 * c2) / (var_sum + var_difference + 2 * c2)
-    return luminance * structure
+    return _local_ssim(_padded(prediction, shape), _padded(target, shape), shape, data_range)
 
 
 def ssim(
@@ -124,17 +138,32 @@ def ssim(
     """Mean local SSIM of each image, over positions and channels: (B,) float64.
 
     prediction, target (B, C, H, W) in [0, data_range]; mask (B, H, W) weighs the windows by the pixel at their centre
-    (no weight left gives NaN). Raises as `ssim_map`.
+    (no weight left gives NaN). Works in tiles of rows: beside the images, memory does not grow with them. Raises as
+    `ssim_map`.
     """
     prediction, target, mask = image_pair(prediction, target, mask)
-    # Image by image where they are large: the working set then stays in the processor's cache.
-    images = max(1, _CHUNK // prediction[0].numel())
-    pairs = zip(prediction.split(images), target.split(images), strict=True)
-    parts = [ssim_map(x, y, window, data_range).mean(dim=1) for x, y in pairs]
-    local = torch.cat(parts)
-    if mask is None:
-        return local.mean(dim=(1, 2))
-    border = WINDOWS[window].border
-    height, width = local.shape[1:]
-    weight = mask[:, border : border + height, border : border + width].double()
-    return (local * weight).sum(dim=(1, 2)) / weight.sum(dim=(1, 2))
+    _check_size(prediction, window)
+    shape = WINDOWS[window]
+    images = max(1, _TILE // prediction[0].numel())
+    masks = [None] * len(prediction) if mask is None else mask.split(images)
+    parts = zip(prediction.split(images), target.split(images), masks)
+    return torch.cat([_tiled(x, y, m, shape, data_range) for x, y, m in parts])
+
+
+def _tiled(prediction: Tensor, target: Tensor, mask: Tensor | None, window: Window, data_range: float) -> Tensor:
+    """`ssim` of a few images: (B,)."""
+    prediction, target = _padded(prediction, window), _padded(target, window)
+    halo, border = len(window.taps) - 1, window.border
+    height, width = prediction.shape[2] - halo, prediction.shape[3] - halo
+    rows = max(_TILE_ROWS, _TILE // prediction[:, :, 0].numel())
+    total = weight = prediction.new_zeros(len(prediction), dtype=torch.float64)
+    for top in range(0, height, rows):
+        bottom = min(top + rows, height)
+        part = slice(top, bottom + halo)
+        local = _local_ssim(prediction[:, :, part], target[:, :, part], window, data_range).mean(dim=1)
+        if mask is not None:
+            weights = mask[:, border + top : border + bottom, border : border + width].double()
+            local = local * weights
+            weight = weight + weights.sum(dim=(1, 2))
+        total = total + local.sum(dim=(1, 2))
+    return total / (height * width if mask is None else weight)
