@@ -63,27 +63,55 @@ def camera_vectors(raymaps: Tensor) -> Tensor:
 
     raymaps [..., 6, h, w] (origin, direction; h, w >= 2) -> [..., 8]: position (3), unit quaternion w, x, y, z (4) and
     the focal length over the image width (1). A map of zeros (dropped pose) gives zeros.
+    """
+    width = raymaps.shape[-1]
+    given, corner, across, down = _image_plane(raymaps)
+    x_axis = torch.nn.functional.normalize(across, dim=-1)
+    y_axis = torch.nn.functional.normalize(down - (down * x_axis).sum(-1, keepdim=True) * x_axis, dim=-1)
+    z_axis = torch.linalg.cross(x_axis, y_axis)
+    depth = (z_axis * corner).sum(-1, keepdim=True)
+    focal = depth / (across.norm(dim=-1, keepdim=True) * width / (width - 1)).clamp_min(1e-12)
+    quaternion = _quaternion(torch.stack([x_axis, y_axis, z_axis], -1))
+    vector = torch.cat([raymaps[..., :3, 0, 0], quaternion, focal], -1)
+    return torch.where(given[..., None], vector, torch.zeros_like(vector))
+
+
+def view_matrices(raymaps: Tensor) -> tuple[Tensor, Tensor]:
+    """Projection of each view and its inverse, read off the raymaps: image_from_reference, reference_from_image.
+
+    raymaps [..., 6, h, w] (origin, direction; h, w >= 2) -> [..., 4, 4] twice. image_from_reference takes a point
+    (x, y, z, 1) of the raymaps' frame to (u d, v d, d, 1): z-depth d, and u, v in [-1, 1] from edge to edge of the
+    image. A map of zeros (dropped pose) gives identities.
+    """
+    height, width = raymaps.shape[-2:]
+    given, corner, across, down = _image_plane(raymaps)
+    along_u, along_v = across * (width / (width - 1) / 2), down * (height / (height - 1) / 2)
+    center = corner + along_u * (1 - 1 / width) + along_v * (1 - 1 / height)
+    forward = torch.nn.functional.normalize(torch.linalg.cross(along_u, along_v), dim=-1)
+    rays_from_image = torch.stack([along_u, along_v, center], -1) / (forward * corner).sum(-1)[..., None, None]
+    rays_from_image = torch.where(given[..., None, None], rays_from_image, torch.eye(3).to(rays_from_image))
+    image_from_rays = torch.linalg.inv(rays_from_image)
+    origin = raymaps[..., :3, 0, 0, None]
+    last = torch.tensor([0.0, 0, 0, 1]).to(origin).expand(*origin.shape[:-2], 1, 4)
+    there = torch.cat([torch.cat([image_from_rays, -image_from_rays @ origin], -1), last], -2)
+    back = torch.cat([torch.cat([rays_from_image, origin], -1), last], -2)
+    return there, back
+
+
+def _image_plane(raymaps: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Whether a pose is given [...], and the plane that the directions of [..., 6, h, w] point to, up to its distance:
+    the top left corner's unit direction and the edges from there to the right and down, [..., 3] each.
 
     A pinhole camera's directions are p = R K^-1 (u, v, 1) up to length, and p is affine in (u, v): the corners obey
     p00 - p10 - p01 + p11 = 0, three equations for the unknown lengths.
     """
-    height, width = raymaps.shape[-2:]
     given = raymaps.abs().amax((-3, -2, -1)) > 0
     d00, d10 = raymaps[..., 3:, 0, 0], raymaps[..., 3:, 0, -1]
     d01, d11 = raymaps[..., 3:, -1, 0], raymaps[..., 3:, -1, -1]
     equations = torch.stack([d10, d01, -d11], -1)
     equations = torch.where(given[..., None, None], equations, torch.eye(3).to(equations))
     lengths = torch.linalg.solve(equations, d00[..., None])[..., 0]
-    across = lengths[..., :1] * d10 - d00  # R K^-1 (u step over width - 1 cells)
-    down = lengths[..., 1:2] * d01 - d00
-    x_axis = torch.nn.functional.normalize(across, dim=-1)
-    y_axis = torch.nn.functional.normalize(down - (down * x_axis).sum(-1, keepdim=True) * x_axis, dim=-1)
-    z_axis = torch.linalg.cross(x_axis, y_axis)
-    depth = (z_axis * d00).sum(-1, keepdim=True)
-    focal = depth / (across.norm(dim=-1, keepdim=True) * width / (width - 1)).clamp_min(1e-12)
-    quaternion = _quaternion(torch.stack([x_axis, y_axis, z_axis], -1))
-    vector = torch.cat([raymaps[..., :3, 0, 0], quaternion, focal], -1)
-    return torch.where(given[..., None], vector, torch.zeros_like(vector))
+    return given, d00, lengths[..., :1] * d10 - d00, lengths[..., 1:2] * d01 - d00
 
 
 def _quaternion(rotation: Tensor) -> Tensor:

@@ -36,6 +36,7 @@ class UNetConfig:
     decoder_only: views meet in the middle and the up path only.
     camera: "raymap" concatenates 6 ray channels; "vector" feeds 8 numbers per view through cross-attention.
     ray_octaves: sines and cosines of the ray channels at this many octaves are concatenated too (0: the rays alone).
+    relative_cameras: 3D attention carries its vectors from camera to camera (`ViewFrames`; not in the paper). No weights.
     """
 
     latent_channels: int = 8
@@ -52,6 +53,7 @@ class UNetConfig:
     camera: CameraInput = "raymap"
     cross_attention_dim: int = 1024
     ray_octaves: int = 0
+    relative_cameras: bool = False
 
     def __post_init__(self) -> None:
         levels = len(self.channels)
@@ -63,6 +65,11 @@ class UNetConfig:
             if channels % self.norm_groups or channels % heads:
                 raise ValueError(
                     f"{channels} channels can't be split into {self.norm_groups} norm groups and {heads} heads."
+                )
+            if self.relative_cameras and channels // heads % 8:
+                raise ValueError(
+                    f"relative_cameras needs heads of a multiple of 8 channels, and {channels} channels on {heads} heads "
+                    f"are {channels // heads} each."
                 )
 
     @property

@@ -34,6 +34,12 @@ class SamplerConfig:
         return cls("ddim", "trailing", 50)
 
 
+def evaluations(config: SamplerConfig, schedule: Schedule) -> int:
+    """How often a group goes through the network: once a step, and once more where guidance is on."""
+    levels = schedule.nodes(config.nodes, config.steps).tolist()
+    return sum(2 if config.guidance.active(level) else 1 for level in levels)
+
+
 def sample(
     model: MultiViewModel, condition_latents: Tensor, raymaps: Tensor, noise: Tensor, config: SamplerConfig
 ) -> Tensor:

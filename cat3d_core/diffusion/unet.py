@@ -6,8 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from cat3d_core.diffusion.attention import SpatialTransformer, zero_
-from cat3d_core.diffusion.conditioning import camera_vectors, ray_features
+from cat3d_core.diffusion.attention import SpatialTransformer, ViewFrames, zero_
+from cat3d_core.diffusion.conditioning import camera_vectors, ray_features, view_matrices
 from cat3d_core.diffusion.config import UNetConfig, ViewAttention
 from cat3d_core.diffusion.layers import Downsample, ResnetBlock, TimeMLP, Upsample, time_embedding
 
@@ -77,16 +77,19 @@ class MultiViewUNet(nn.Module):
         context = None
         if self.config.camera == "vector":
             context = self.camera_embedding(camera_vectors(raymaps.float()).to(dtype)).flatten(0, 1)[:, None]
+        frames = None
+        if self.config.relative_cameras:
+            frames = ViewFrames(*(m.flatten(0, 1).to(dtype) for m in view_matrices(raymaps.float())))
         embedded = self.time_embedding(time_embedding(time, self.config.channels[0]).to(dtype))
         embedded = F.silu(embedded).repeat_interleave(views, 0)
 
         x = self.conv_in(x)
         skips = [x]
         for down in self.down_blocks:
-            x = down(x, skips, embedded, views, context)
-        x = self.mid_block(x, [], embedded, views, context)
+            x = down(x, skips, embedded, views, context, frames)
+        x = self.mid_block(x, [], embedded, views, context, frames)
         for up in self.up_blocks:
-            x = up(x, skips, embedded, views, context)
+            x = up(x, skips, embedded, views, context, frames)
         x = self.conv_out(F.silu(self.conv_norm_out(x)))
         return x.unflatten(0, (groups, views))
 
@@ -128,18 +131,26 @@ class Level(nn.Module):
         elif isinstance(resample, Upsample):
             self.upsamplers = nn.ModuleList([resample])
 
-    def forward(self, x: Tensor, skips: list[Tensor], time: Tensor, views: int, context: Tensor | None) -> Tensor:
+    def forward(
+        self,
+        x: Tensor,
+        skips: list[Tensor],
+        time: Tensor,
+        views: int,
+        context: Tensor | None,
+        frames: ViewFrames | None,
+    ) -> Tensor:
         """x [G*V, C, h, w]. The down path pushes its results to `skips`, the up path takes them back."""
         attentions = getattr(self, "attentions", [])
         if self.middle:
             x = self.resnets[0](x, time)
-            x = attentions[0](x, views, context)
+            x = attentions[0](x, views, context, frames)
             middle_out: Tensor = self.resnets[1](x, time)
             return middle_out
         for i, resnet in enumerate(self.resnets):
             x = resnet(torch.cat([x, skips.pop()], 1) if self.decoder else x, time)
             if len(attentions):
-                x = attentions[i](x, views, context)
+                x = attentions[i](x, views, context, frames)
             if not self.decoder:
                 skips.append(x)
         for downsample in getattr(self, "downsamplers", []):

@@ -38,7 +38,8 @@ def starting_config(config: ModelConfig, start: Path | None) -> ModelConfig:
         return config
     if _is_ours(start):
         theirs = load_model(start).config
-        if theirs.unet != config.unet:
+        # relative_cameras has no weights: a network may take it up, or lay it off, in the middle of its training.
+        if dataclasses.replace(theirs.unet, relative_cameras=config.unet.relative_cameras) != config.unet:
             raise ValueError(f"{start} holds another U-Net than the one asked for: {_differences(theirs, config)}.")
         return config
     return dataclasses.replace(config, unet=_from_stable_diffusion(start, config)[0].config)
@@ -72,7 +73,8 @@ def _is_ours(path: Path) -> bool:
 
 
 def _from_stable_diffusion(path: Path, config: ModelConfig) -> Any:
-    kept = ("latent_channels", "latent_size", "view_attention", "max_3d_size", "decoder_only", "camera", "ray_octaves")
+    kept = ("latent_channels", "latent_size", "view_attention", "max_3d_size", "decoder_only", "camera", "ray_octaves",
+            "relative_cameras")  # fmt: skip
     changes = {name: getattr(config.unet, name) for name in kept}
     return load_stable_diffusion(path, **changes)
 

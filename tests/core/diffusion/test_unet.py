@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.diffusion import SIZES, MultiViewUNet, count_flops, count_parameters
-from cat3d_core.diffusion.attention import fold_views, unfold_views
-from cat3d_core.diffusion.conditioning import camera_vectors, relative_raymaps
+from cat3d_core.diffusion.attention import Attention, ViewFrames, fold_views, unfold_views
+from cat3d_core.diffusion.conditioning import camera_vectors, relative_raymaps, view_matrices
 from cat3d_core.rays import raymap
 from tests.core.diffusion.models import inputs, random_model, randomized, tiny
 
@@ -55,7 +55,7 @@ def test_one_view_is_the_2d_network(changes):
     torch.testing.assert_close(together.flatten(0, 1), alone.flatten(0, 1), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("changes", VARIANTS)
+@pytest.mark.parametrize("changes", [*VARIANTS, {"relative_cameras": True}])
 def test_permuting_views_permutes_outputs(changes):
     unet = random_model(**changes).unet
     latents, time, raymaps, mask = inputs(2, 5, 2)
@@ -66,7 +66,7 @@ def test_permuting_views_permutes_outputs(changes):
     torch.testing.assert_close(got, expected, rtol=0, atol=2e-5)
 
 
-@pytest.mark.parametrize("changes", VARIANTS)
+@pytest.mark.parametrize("changes", [*VARIANTS, {"relative_cameras": True}])
 def test_groups_never_mix_and_views_do(changes):
     """The gradient of one group's output reaches no other group, and every view of its own."""
     unet = random_model(**changes).unet
@@ -115,8 +115,9 @@ def test_rigid_motion_of_the_world_changes_nothing(seed):
     torch.testing.assert_close(relative, before, rtol=0, atol=1e-12)
 
 
-def test_network_output_is_invariant_to_rigid_motion():
-    unet = random_model().unet
+@pytest.mark.parametrize("changes", [{}, {"relative_cameras": True}])
+def test_network_output_is_invariant_to_rigid_motion(changes):
+    unet = random_model(**changes).unet
     latents, time, _, mask = inputs(1, 4, 1)
     cameras = _cameras(4, 3)
     motion = _cameras(1, 4).world_from_camera[0]
@@ -140,6 +141,47 @@ def test_camera_vector_is_read_off_the_raymap(seed):
     assert torch.equal(camera_vectors(torch.zeros(2, 6, 5, 5)), torch.zeros(2, 8))
 
 
+@given(st.integers(0, 10_000))
+def test_projections_are_read_off_the_raymap(seed):
+    """A point's image place and depth, exact to 1e-9 in float64; the inverse; identities for a dropped pose."""
+    cameras = _cameras(3, seed)
+    there, back = view_matrices(raymap(cameras, cameras.world_from_camera[0], 6, 5))
+    point = torch.tensor([0.3, -0.2, 0.5, 1], dtype=torch.float64)
+    in_camera = (torch.linalg.inv(cameras.world_from_camera) @ cameras.world_from_camera[0] @ point)[:, :3]
+    pixels = (cameras.intrinsics @ in_camera[..., None])[..., 0] * torch.tensor([2 / 64, 2 / 64, 1.0])
+    pixels[:, :2] -= in_camera[:, 2:]
+    torch.testing.assert_close(there @ point, torch.cat([pixels, torch.ones(3, 1)], 1).double(), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(there @ back, torch.eye(4).double().expand(3, 4, 4), rtol=0, atol=1e-9)
+    dropped = view_matrices(torch.zeros(2, 6, 5, 5))
+    assert torch.equal(torch.stack(dropped), torch.eye(4).expand(2, 2, 4, 4))
+
+
+@given(st.integers(0, 10_000))
+def test_attention_between_cameras_does_not_know_the_reference_frame(seed):
+    """Only P_i P_j^-1 counts: another common frame, here even a projective one, gives the same output; another camera
+    doesn't. Without views to compare (one camera, one place) it is plain attention."""
+    g = torch.Generator().manual_seed(seed)
+    there = torch.eye(4).double() + 0.3 * torch.randn(6, 4, 4, generator=g, dtype=torch.float64)
+    frame = torch.eye(4).double() + 0.1 * torch.randn(4, 4, generator=g, dtype=torch.float64)
+    attention = Attention(32, 2).double()
+    tokens = torch.randn(2, 3 * 6, 32, generator=g, dtype=torch.float64)
+
+    def attend(matrices):
+        with torch.no_grad():
+            return attention(tokens, None, ViewFrames(matrices, torch.linalg.inv(matrices)).at(2, 3))
+
+    first = attend(there)
+    scale = float(torch.linalg.cond(there).max() * torch.linalg.cond(frame))
+    torch.testing.assert_close(attend(there @ frame), first, rtol=0, atol=1e-12 * scale**2)
+    there[1, 0, 3] += 0.5
+    assert (attend(there) - first).abs().max() > 1e-6
+    same = ViewFrames(there[:1], torch.linalg.inv(there[:1])).at(1, 1)
+    with torch.no_grad():
+        torch.testing.assert_close(
+            attention(tokens[:1, :1], None, same), attention(tokens[:1, :1]), rtol=0, atol=1e-12 * scale**2
+        )
+
+
 def test_paper_size_has_850_million_parameters():
     """Within 5% (the paper's figure), counted without allocating."""
     assert abs(count_parameters(SIZES["paper"].unet) / 850e6 - 1) < 0.05
@@ -157,8 +199,9 @@ def test_flops_are_those_of_convolutions_products_and_joint_attention():
     assert 5e12 < count_flops(SIZES["paper"].unet) < 8e12
 
 
-def test_odd_latent_sizes_and_bfloat16_run():
-    unet = random_model().unet
+@pytest.mark.parametrize("changes", [{}, {"relative_cameras": True}])
+def test_odd_latent_sizes_and_bfloat16_run(changes):
+    unet = random_model(**changes).unet
     latents, time, raymaps, mask = inputs(1, 3, 1)
     with torch.no_grad():
         odd = unet(latents[..., :7, :5], time, raymaps[..., :7, :5], mask)
