@@ -57,7 +57,7 @@ MUTATIONS: dict[str, tuple[Callable[..., Any], dict[str, str], str]] = {
         "losses.charbonnier",
     ),
     "SSIM in float32": (
-        ssim.ssim_map,
+        ssim._local_ssim,
         {"prediction, target = prediction.double(), target.double()": "pass"},
         "ssim.ssim[",
     ),
