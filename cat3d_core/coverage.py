@@ -11,6 +11,7 @@ measure moves with the world and has no unit.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -55,8 +56,7 @@ def direction_bins(cameras: Cameras, frame: SceneFrame, voxels: Tensor) -> Tenso
     out = []
     for i in range(0, len(cameras), 32):
         some = cameras[slice(i, i + 32)]
-        pixels, depth = some.project(voxels)
-        seen = (depth > 0) & (pixels >= 0).all(-1) & (pixels <= some.size[:, None].to(pixels)).all(-1)
+        seen = _sees(some, voxels)
         toward = (some.centers[:, None] - voxels[None]) @ frame.axes.T
         out.append(torch.where(seen, bin_of(toward), _NONE))
     return torch.cat(out) if out else torch.zeros(0, len(voxels), dtype=torch.long)
@@ -88,6 +88,30 @@ def gains(bins: Tensor, given: Tensor | None = None) -> Tensor:
         added.append(int((~covered[k, b]).sum()))
         covered[k, b] = True
     return torch.tensor(added, dtype=torch.long)
+
+
+def seen_from_nearby(views: Cameras, given: Cameras, voxels: Tensor, angle_deg: float) -> Tensor:
+    """(N,) which share of the voxels (K, 3) that a view sees, some given camera sees from at most `angle_deg` beside it
+    (the angle at the voxel between the directions to both); 1 for a view that sees none. Distances do not count."""
+
+    def directions(cameras: Cameras) -> tuple[Tensor, Tensor]:
+        toward = torch.nn.functional.normalize(cameras.centers[:, None] - voxels[None], dim=-1)
+        return toward, _sees(cameras, voxels)
+
+    known, known_seen = directions(given)
+    out = []
+    for i in range(0, len(views), 16):
+        toward, seen = directions(views[slice(i, i + 16)])
+        cosine = torch.einsum("nkd,vkd->nvk", toward, known).masked_fill(~known_seen, -1).amax(1)
+        near = cosine >= math.cos(math.radians(angle_deg))
+        out.append((near & seen).sum(1) / seen.sum(1).clamp(min=1) + (~seen.any(1)).double())
+    return torch.cat(out)
+
+
+def _sees(cameras: Cameras, voxels: Tensor) -> Tensor:
+    """(N, K) whether the middle of voxel k is in the image of camera n, at positive depth."""
+    pixels, depth = cameras.project(voxels)
+    return (depth > 0) & (pixels >= 0).all(-1) & (pixels <= cameras.size[:, None].to(pixels)).all(-1)
 
 
 def _covered(bins: Tensor) -> Tensor:

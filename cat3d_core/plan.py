@@ -11,12 +11,14 @@ import torch
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.coverage import Coverage, coverage, direction_bins, gains, voxel_grid
+from cat3d_core.coverage import Coverage, coverage, direction_bins, gains, seen_from_nearby, voxel_grid
 from cat3d_core.sample_sets import KINDS, kept_window, sample_cameras
 from cat3d_core.trajectories import RECIPES, FreeSpace, SceneFrame, build_trajectory, choose_recipe, scene_frame
 from cat3d_core.view_selection import NO_VIEW, consecutive_groups, farthest_points, nearest_views, pad_group
 
 SQUARE, WIDE = range(2)
+#: A captured view this close in direction shows a place as a generated one would.
+COVERED_DEG = 15.0
 _VIEWS_PER_PASS = 8  # conditioning + target views the model was trained for
 
 
@@ -30,7 +32,9 @@ class PlanConfig:
     of a single image are made in groups of 7 on that image alone. keep_captured: captured views take conditioning
     slots before anchors do. samples: 'square', 'wide' or 'both' ('both' generates every view twice). image_size: side
     of a sample in pixels. pitch_down_deg: how far a single captured camera looks down (several show it themselves).
-    drop_by_coverage: leave out views that add nothing to the coverage.
+    drop_by_coverage: leave out views that add nothing to the coverage. covered_share: plan that nothing be generated
+    where captured views see this share of what the path's views see from nearly the same directions (at most
+    COVERED_DEG beside them); None: generate in any case.
     """
 
     trajectory: str = "auto"
@@ -48,6 +52,7 @@ class PlanConfig:
     image_size: int = 512
     pitch_down_deg: float = 0.0
     drop_by_coverage: bool = False
+    covered_share: float | None = None
 
     def __post_init__(self) -> None:
         if self.trajectory != "auto" and self.trajectory not in RECIPES:
@@ -75,6 +80,7 @@ class Plan:
     False for repeats, whose outputs are dropped. sample_kind (N,): 0 square, 1 wide. window (N, 4): [x0, y0, width,
     height] of the sample to keep. recipe: name. reasons: why, in sentences. frame: the scene as the plan saw it.
     captured_count: V. captured_coverage, plan_coverage: before and after (captured and planned views together).
+    needed: False where captured views cover the path already (`PlanConfig.covered_share`): sample nothing.
     """
 
     cameras: Cameras
@@ -95,6 +101,7 @@ class Plan:
     captured_count: int
     captured_coverage: Coverage
     plan_coverage: Coverage
+    needed: bool = True
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -147,7 +154,18 @@ def make_plan(
     voxels = voxel_grid(frame, points)
     before = direction_bins(sample_cameras(captured, kinds[-1], config.image_size), frame, voxels)
     after = direction_bins(_with_poses(captured, poses, kinds[-1], config.image_size), frame, voxels)
-    if config.drop_by_coverage:
+    needed = True
+    if config.covered_share is not None:
+        planned = _with_poses(captured, poses, kinds[-1], config.image_size)
+        known = sample_cameras(captured, kinds[-1], config.image_size)
+        share = float(seen_from_nearby(planned, known, voxels, COVERED_DEG).mean())
+        needed = share < config.covered_share
+        seen = f"captured views see {share:.0%} of what its views see from within {COVERED_DEG:g} degrees of them"
+        if needed:
+            reasons.append(f"The path is not covered by captured views: {seen} ({config.covered_share:.0%} would do).")
+        else:
+            reasons.append(f"The path is covered, so its {len(poses)} views need not be generated: {seen}.")
+    if config.drop_by_coverage and needed:
         useful = gains(after, before) > 0
         if useful.any() and not useful.all():
             reasons.append(
@@ -165,6 +183,7 @@ def make_plan(
         captured_count=len(captured),
         captured_coverage=coverage(before),
         plan_coverage=coverage(torch.cat([before, after])),
+        needed=needed,
     )
 
 

@@ -19,6 +19,7 @@ from pydantic import (
     PositiveFloat,
     PositiveInt,
     ValidationError,
+    model_validator,
 )
 
 from schemas.errors import ConfigError
@@ -42,6 +43,8 @@ class IngestConfig(_Model):
 class PosesConfig(_Model):
     """Estimating cameras, where the source has none."""
 
+    estimate: Literal["missing", "always"] = "missing"
+    """`missing`: skipped where the source has cameras; `always`: also there."""
     max_features: PositiveInt = 4000
     """Image features extracted per photo at most."""
     camera_model: Literal["SIMPLE_RADIAL", "OPENCV", "SIMPLE_PINHOLE", "PINHOLE"] = "SIMPLE_RADIAL"
@@ -77,15 +80,13 @@ class PlanConfig(_Model):
     """Captured views take conditioning slots before anchors do."""
     wide: bool = False
     """Add the wide samples from padded squares for photos that aren't square."""
-    drop_by_coverage: bool = False
-    """Leave out views that add nothing to the coverage of the scene."""
 
 
 class SampleConfig(_Model):
     """Sampling views from the diffusion model (paper, section 3.1).
 
     solver, nodes, steps, guidance: None takes what the model's file recommends (a briefly trained model is at its best
-    after few steps without guidance), else the point on the measured front: unipc, log_snr, 20 steps, guidance 3.
+    after few steps without guidance), else the point on the measured front: unipc, log_snr, 10 steps, guidance 3.
     """
 
     checkpoint: Path | None = None
@@ -98,8 +99,9 @@ class SampleConfig(_Model):
     """Sampler steps (paper: 50)."""
     guidance: NonNegativeFloat | None = None
     """Classifier-free guidance weight."""
-    guidance_log_snr: tuple[FiniteFloat | None, FiniteFloat | None] = (None, None)
-    """Lowest and highest log-SNR at which guidance is on; None: no bound."""
+    guidance_log_snr: tuple[FiniteFloat | None, FiniteFloat | None] | None = None
+    """Lowest and highest log-SNR at which guidance is on, where `skip.guidance` is; a bound of None: no bound.
+    None: up to 2, the interval on the measured front."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """Of the network; the sampler's state is float32 always. bfloat16 is for GPUs."""
 
@@ -162,6 +164,38 @@ class EvaluateConfig(_Model):
     """Compute LPIPS, where weights are there."""
 
 
+class SkipConfig(_Model):
+    """Work that a scene may not need, a switch for each; `skip: none` and `skip: all` set all of them.
+
+    A switch that is off changes no result. What was skipped, why and what it saved is among the decisions of the
+    stage. The defaults are on the measured front (docs/skips.md).
+    """
+
+    coverage: bool = True
+    """Plan: views that add nothing to the coverage of the scene."""
+    covered_path: bool = True
+    """Plan: all generated views, where captured views see what the path sees from nearly the same directions."""
+    rounds: bool = False
+    """Sample: groups are sampled in rounds, each where a briefly trained field knows least, as long as a round lowers
+    its error in a held-out captured view."""
+    near_steps: bool = False
+    """Sample: half of the steps for groups near captured views."""
+    guidance: bool = True
+    """Sample: the unconditional half of the network outside the interval `sample.guidance_log_snr`."""
+    solver: bool = True
+    """Sample: steps beyond those a better solver needs for the error of the paper's 50 steps of DDIM. Models whose
+    file recommends a sampler are sampled with that one either way."""
+    workers: bool = True
+    """Sample, decode: worker processes for what this one has done before they would have started."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _all_or_none(cls, value: Any) -> Any:
+        if value in ("all", "none"):
+            return dict.fromkeys(cls.model_fields, value == "all")
+        return value
+
+
 class RunConfig(_Model):
     """One run of one scene."""
 
@@ -180,6 +214,7 @@ class RunConfig(_Model):
     reconstruct: ReconstructConfig = Field(default_factory=ReconstructConfig)
     render: RenderConfig = Field(default_factory=RenderConfig)
     evaluate: EvaluateConfig = Field(default_factory=EvaluateConfig)
+    skip: SkipConfig = Field(default_factory=SkipConfig)
     execution: ExecutionConfig = Field(default_factory=ExecutionConfig)
 
 

@@ -19,12 +19,13 @@ from torch import Tensor, nn
 
 from cat3d_core.diffusion import SIZES, GuidanceConfig, MultiViewModel, SamplerConfig, Schedule, load_model, sample
 from cat3d_core.diffusion.config import ModelConfig
+from cat3d_core.diffusion.sampler import evaluations
 from cat3d_core.diffusion.schedule import Nodes, alpha_sigma
 from cat3d_core.diffusion.solvers import SolverName
 from cat3d_core.random import generator
 
-# Log-SNR intervals of guidance: everywhere, and without the noisiest and the cleanest part.
-INTERVALS = {"all": (-math.inf, math.inf), "middle": (-5.0, 2.0)}
+# Log-SNR intervals of guidance: everywhere, without the cleanest part, and without the noisiest part too.
+INTERVALS = {"all": (-math.inf, math.inf), "below 2": (-math.inf, 2.0), "middle": (-5.0, 2.0)}
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 REFERENCE = ("dpm++", "log_snr", 1000)
 Problem = tuple[MultiViewModel, Tensor, Tensor, Tensor]  # model, conditioning latents, raymaps, noise
@@ -107,8 +108,9 @@ def rows(
     model_path: Path | None = None, steps: tuple[int, ...] = (10, 15, 20, 30, 50), groups: int | None = None
 ) -> list[dict[str, Any]]:
     """One row per problem, solver, nodes, steps, guidance interval and dtype: `evaluations` a group, `seconds` a group,
-    `error` (median over groups of the RMS difference from the reference), `error_p90`, and `interval_change` (how far
-    the reference itself moves when guidance is limited to the interval). model_path: also measure this model."""
+    `error` (median over groups of the RMS difference from the reference with the same interval), `error_p90`,
+    `error_guided` (the difference from the reference that is guided everywhere), and `interval_change` (how far the
+    reference itself moves when guidance is limited to the interval). model_path: measure this model instead."""
     name, problem = ("mixture", mixture_problem(groups or 64))
     if model_path is not None:
         name, problem = "model", model_problem(model_path, groups or 2)
@@ -130,22 +132,22 @@ def rows(
                         config = SamplerConfig(solver, nodes, count, guidance)
                         row = {"problem": name, "solver": solver, "nodes": nodes, "steps": count, "interval": interval}
                         change = (references[interval] - references["all"]).square().mean().sqrt()
-                        measured = _measure(problem, config, references[interval])
+                        measured = _measure(problem, config, references[interval], references["all"])
                         result.append(row | {"dtype": dtype_name, "interval_change": float(change)} | measured)
     return result
 
 
-def _measure(problem: Problem, config: SamplerConfig, reference: Tensor) -> dict[str, float]:
+def _measure(problem: Problem, config: SamplerConfig, reference: Tensor, guided: Tensor) -> dict[str, float]:
     model, latents, raymaps, noise = problem
     start = time.perf_counter()
     out = sample(model, latents, raymaps, noise, config)
     seconds = time.perf_counter() - start
     error = (out.double() - reference).square().mean((1, 2, 3, 4)).sqrt()
-    levels = Schedule(model.config.schedule, noise.shape[1]).nodes(config.nodes, config.steps).tolist()
     return {
-        "evaluations": sum(2 if config.guidance.active(level) else 1 for level in levels),
+        "evaluations": evaluations(config, Schedule(model.config.schedule, noise.shape[1])),
         "seconds": seconds / len(noise),
         "error": float(error.median()),
+        "error_guided": float((out.double() - guided).square().mean((1, 2, 3, 4)).sqrt().median()),
         "error_p90": float(error.quantile(0.9)),
     }
 

@@ -51,7 +51,8 @@ def _left_to_its_flow(what: str) -> Iterator[None]:
 
 
 def prepared(job: Job) -> Work | None:
-    """The job's groups to sample, after the stages before sampling; None where they are sampled already."""
+    """The job's groups to sample, after the stages before sampling; None where they are sampled already, or chosen only
+    while sampling."""
     capture = job.capture()
     ensure_store(job, capture)
     prepare_run(job, capture)
@@ -59,6 +60,6 @@ def prepared(job: Job) -> Work | None:
     for step in pending(job, steps):
         if step.stage in PREPARATION:
             execute_stage(job, step)
-    if not any(step.stage == "sample" for step in pending(job, steps)):
+    if job.config.skip.rounds or not any(step.stage == "sample" for step in pending(job, steps)):
         return None
     return sample_work(job, SceneStore.open(job.store_path, "r+"), steps["sample"].key)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from flows.progress import Meter, meter
 from flows.sampling.executors import Executor, open_executor
-from flows.sampling.work import Answer, Batch, Work, WorkerError
+from flows.sampling.work import Answer, Batch, Work, WorkerError, run_batch
 from schemas.config import ExecutionConfig
 from schemas.scene_store import SceneStore
 
@@ -32,6 +32,10 @@ class Totals:
     loading_seconds: float = 0.0
     decisions: list[str] = field(default_factory=list)
 
+    def __add__(self, other: Totals) -> Totals:
+        summed = {name: getattr(self, name) + getattr(other, name) for name in vars(self) if name != "workers"}
+        return Totals(max(self.workers, other.workers), **summed)
+
     def work(self) -> dict[str, float]:
         """Counts for the stage's record."""
         return {name: value for name, value in vars(self).items() if name != "decisions" and self.workers}
@@ -47,17 +51,23 @@ class _Out:
     seen: float
 
 
-def fan_out(works: Sequence[Work], settings: ExecutionConfig, label: str) -> Totals:
+def fan_out(works: Sequence[Work], settings: ExecutionConfig, label: str, here: bool = False) -> Totals:
     """Do all works, of one scene or of many, on the workers the settings ask for.
 
+    here: do without workers what takes no longer than one batch, unless the settings say how many there are.
     Raises the first error that a worker met and can't be cured by another worker; WorkerError when `attempts` workers
     died on one item. What is complete by then stays; workers are gone and nothing half-written is left.
     """
     views = sum(len(work.views[i]) for work in works for items in work.passes for i in items)
     if not views:
         return Totals()
-    folder = works[0].job.out / ".work"
+    folder, done = works[0].job.out / ".work", Totals()
     with meter(label, views) as progress:
+        if here and settings.workers is None and settings.executor == "local":
+            done = _done_here(works, settings, progress)
+            if not any(items for work in works for items in work.passes):
+                done.decisions.append("Started no workers: this process did it in less than a batch takes.")
+                return done
         executor = open_executor(settings, folder)
         sharing = _Sharing(works, executor, settings, progress)
         try:
@@ -67,7 +77,27 @@ def fan_out(works: Sequence[Work], settings: ExecutionConfig, label: str) -> Tot
             if executor.exclusive:
                 for path in {work.job.store_path for work in works}:
                     SceneStore.open(path, "r+").sweep()
-    return sharing.totals
+    return done + sharing.totals
+
+
+def _done_here(works: Sequence[Work], settings: ExecutionConfig, progress: Meter) -> Totals:
+    """Do items in this process while all that is left would take no longer than `batch_seconds`, and take them off."""
+    totals = Totals()
+    count = settings.groups_at_once
+    for work in works:
+        for items in work.passes:
+            while items:
+                batch = tuple(items[:count])
+                answer = run_batch(Batch(number=0, job=work.job, stage=work.stage, key=work.key, items=batch))
+                answer.raise_error()
+                del items[: len(batch)]
+                progress.advance(sum(len(work.views[i]) for i in batch))
+                totals += Totals(1, 1, answer.seconds, answer.loading_seconds)
+                each = answer.seconds / len(batch)
+                if each * sum(len(items) for work in works for items in work.passes) > settings.batch_seconds:
+                    return totals
+                count = max(settings.groups_at_once, int(POLL_S / max(each, 1e-9)))
+    return totals
 
 
 class _Sharing:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.random import normal
 from cat3d_core.rays import raymap
 from cat3d_core.sample_sets import KINDS, sample_cameras
+from cat3d_core.view_selection import pose_distance
 from flows.stages.common import read_cameras
 from schemas.content_key import content_key
 from schemas.scene_store import Run, SceneStore
@@ -52,12 +54,16 @@ class StoredPlan:
             section.read("sample_kind"),
         )
         self.anchor: NDArray[np.bool_] = section.read("anchor")
+        self.needed = bool(section.attrs["needed"])
 
     def __len__(self) -> int:
         return len(self.cameras)
 
     def passes(self) -> list[list[int]]:
-        """Numbers of the groups that can be sampled at the same time: those of anchors, then the others."""
+        """Numbers of the groups that can be sampled at the same time: those of anchors, then the others; none where
+        nothing need be generated."""
+        if not self.needed:
+            return []
         first = [g for g, group in enumerate(self.groups) if self.anchor[group.targets[0]]]
         return [p for p in (first, sorted(set(range(len(self.groups))) - set(first))) if p]
 
@@ -80,6 +86,15 @@ class StoredPlan:
     def noise(self, group: Group, shape: tuple[int, int, int]) -> Tensor:
         """(N, C, h, w): each view's own numbers, whatever group, batch or worker it is in."""
         return torch.stack([normal(shape, self.seed, self.store.scene_id, view, "noise") for view in group.targets])
+
+    def distance(self, group: Group) -> float:
+        """How far the targets are from the nearest captured view they are conditioned on, on average: pose distance in
+        scene units (see `pose_distance`); infinite for groups conditioned on anchors alone."""
+        captured = [view for view in group.conditions if view < self.captured_count]
+        if not captured:
+            return math.inf
+        distances = pose_distance(self.cameras[group.targets], self.captured[group.kind][captured], scale=1.0)
+        return float(distances.amin(1).mean())
 
     def _camera(self, view: int, kind: str) -> Cameras:
         if view < self.captured_count:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,6 +26,11 @@ class Ingested(NamedTuple):
     image: np.ndarray
     mask: np.ndarray | None
     intrinsics: Tensor | None
+
+
+def inputs(job: Job) -> dict[str, Any]:
+    """Where cameras are estimated though there are some, the pose stage writes other images over these."""
+    return {"estimate": "always"} if job.config.poses.estimate == "always" else {}
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:

@@ -18,12 +18,19 @@ from schemas.errors import ConfigError
 from schemas.scene_store import Run, SceneStore
 
 VERSION = 1
+#: `skip.covered_path`: how much of what the path's views see captured views must show from nearby directions.
+COVERED_SHARE = 0.9
 
 
 def inputs(job: Job) -> dict[str, Any]:
-    """What the model wants: the side of its images in pixels, and the views of a group."""
-    model = model_config(job)
-    return {"image_size": model.image_size, "views": model.views}
+    """What the model wants (the side of its images in pixels, the views of a group), and what may be skipped."""
+    model, skip = model_config(job), job.config.skip
+    return {
+        "image_size": model.image_size,
+        "views": model.views,
+        "drop_by_coverage": skip.coverage,
+        "covered_share": COVERED_SHARE if skip.covered_path else None,
+    }
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
@@ -56,7 +63,7 @@ def plan_run(job: Job, store: SceneStore, run: Run) -> tuple[Plan, list[int]]:
 
 def core_config(job: Job, captured: Cameras) -> PlanConfig:
     """The core's settings for the run's; conditioning views and targets together are what the model was trained for."""
-    settings, model = job.config.plan, model_config(job)
+    settings, model, skip = job.config.plan, model_config(job), inputs(job)
     conditions = settings.condition_views or min(3, model.views - 1)
     group_size = settings.group_size
     if group_size is None and model.views != 8:
@@ -80,7 +87,8 @@ def core_config(job: Job, captured: Cameras) -> PlanConfig:
         keep_captured=settings.always_captured,
         samples="both" if settings.wide and not_square else "square",
         image_size=model.image_size,
-        drop_by_coverage=settings.drop_by_coverage,
+        drop_by_coverage=skip["drop_by_coverage"],
+        covered_share=skip["covered_share"],
     )
 
 
@@ -114,6 +122,7 @@ def write_plan(run: Run, plan: Plan, train: list[int], captured_count: int) -> N
     section.set_attrs(
         recipe=plan.recipe,
         reasons=plan.reasons,
+        needed=plan.needed,
         image_size=int(plan.cameras.size[0, 0]),
         kinds=[KINDS[k] for k in sorted(set(plan.sample_kind.tolist()))],
         captured_coverage=plan.captured_coverage,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 
 import numpy as np
 import torch
@@ -24,6 +25,8 @@ VERSION = 1
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     """Write `world_from_camera` (scene frame), `registered`, points and depth bounds, and the similarity."""
     capture = job.capture()
+    if job.config.poses.estimate == "always":
+        capture = dataclasses.replace(capture, cameras=None, distortion=None, points=None, depth_bounds=None)
     if capture.cameras is not None:
         decisions = ["Skipped pose estimation: the cameras are given."]
         cameras = _stored_cameras(store, capture.cameras)

@@ -2,46 +2,72 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 
+from cat3d_core.diffusion import SamplerConfig, Schedule
+from cat3d_core.diffusion.sampler import evaluations
 from flows.jobs import Job, Outcome
-from flows.sampling.fan_out import fan_out
+from flows.sampling.fan_out import Totals, fan_out
 from flows.sampling.groups import Group, StoredPlan, view_keys
 from flows.sampling.model import model_config, model_hash, sampler_config, sampler_settings, shared_model
+from flows.sampling.rounds import OneRound, Rounds
 from flows.sampling.shrinking import sample_at_most
 from flows.sampling.work import Work, is_done
 from schemas.scene_store import SceneStore
 
 VERSION = 1
+#: `skip.near_steps`: mean pose distance (scene distances, about radians of turning) from a group's views to the nearest
+#: captured view below which the group takes half of the steps.
+NEAR = 0.25
 
 
 def inputs(job: Job) -> dict[str, Any]:
-    """The model's weights, and the sampler it is used with."""
-    return {"model": model_hash(job), "sampler": sampler_settings(job)}
+    """The model's weights, the sampler it is used with, and how the views are chosen."""
+    return {"model": model_hash(job), "sampler": sampler_settings(job), "rounds": job.config.skip.rounds}
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
-    """Write `generated/latent`, each view recorded in `done_latent` when it is complete; only missing ones are made."""
-    work = sample_work(job, store, key)
-    groups = [g for items in work.passes for g in items]
-    totals = fan_out([work], job.config.execution, f"sample {job.scene_id} {job.run}")
-    counts = {"views": sum(len(work.views[g]) for g in groups), "groups": len(groups)}
-    return Outcome(counts | {"steps": sampler_settings(job)["steps"] * len(groups)} | totals.work(), totals.decisions)
+    """Write `generated/latent`, each view recorded in `done_latent` when it is complete; only missing ones are made.
+
+    Views that the scene doesn't need are recorded there as left out on purpose.
+    """
+    run = store.run(job.run)
+    plan = StoredPlan(store, run, job.config.seed)
+    rounds = Rounds(job, store, plan) if job.config.skip.rounds else OneRound(plan)
+    totals, groups = Totals(), []
+    for passes in rounds:
+        work = sample_work(job, store, key, passes)
+        groups += [g for items in work.passes for g in items]
+        label = f"sample {job.scene_id} {job.run}"
+        totals += fan_out([work], job.config.execution, label, here=job.config.skip.workers)
+    made = {view for g in rounds.kept for view in plan.groups[g].targets}
+    left_out = sorted(set(range(len(plan))) - made)
+    run.generated.mark_skipped("done_latent", left_out)
+    decisions = [f"{len(left_out)} of {len(plan)} planned views were left out."] if left_out else []
+    decisions += rounds.decisions + sampler_decisions(job, plan, rounds.kept) + totals.decisions
+    configs = [group_sampler(job, plan, plan.groups[g]) for g in groups]
+    counts = {"views": sum(len(plan.groups[g].targets) for g in groups), "groups": len(groups)}
+    spent = sum(group_evaluations(job, plan.groups[g], c) for g, c in zip(groups, configs, strict=True))
+    counts |= {"steps": sum(c.steps for c in configs), "evaluations": spent}
+    return Outcome(counts | totals.work(), decisions)
 
 
-def sample_work(job: Job, store: SceneStore, key: str) -> Work:
-    """The groups that are to be sampled: anchors first, then all others. Makes room for the latents."""
+def sample_work(job: Job, store: SceneStore, key: str, passes: Sequence[Sequence[int]] | None = None) -> Work:
+    """The groups that are to be sampled: anchors first, then all others, or those of `passes`. Makes room for the
+    latents."""
     run = store.run(job.run)
     plan = StoredPlan(store, run, job.config.seed)
     shape = latent_shape(job)
     run.generated.create_array("latent", (len(plan), *shape))
     run.generated.create_array("done_latent", (len(plan), 32))
     targets = [group.targets for group in plan.groups]
-    keys = view_keys(key, len(plan))
-    return Work(job, "sample", key, run.generated, "done_latent", "latent", keys, plan.passes(), targets)
+    keys, passes = view_keys(key, len(plan)), plan.passes() if passes is None else passes
+    return Work(job, "sample", key, run.generated, "done_latent", "latent", keys, passes, targets)
 
 
 def latent_shape(job: Job) -> tuple[int, int, int]:
@@ -50,17 +76,55 @@ def latent_shape(job: Job) -> tuple[int, int, int]:
     return unet.latent_channels, unet.latent_size, unet.latent_size
 
 
+def group_sampler(job: Job, plan: StoredPlan, group: Group) -> SamplerConfig:
+    """The sampler of one group: with `skip.near_steps` half of the steps where its views are close to captured ones."""
+    config = sampler_config(job)
+    if job.config.skip.near_steps and plan.distance(group) < NEAR:
+        return replace(config, steps=math.ceil(config.steps / 2))
+    return config
+
+
+def group_evaluations(job: Job, group: Group, config: SamplerConfig) -> int:
+    """Evaluations of the network for a group."""
+    model = model_config(job)
+    return evaluations(config, Schedule(model.schedule, model.views - len(group.conditions)))
+
+
+def sampler_decisions(job: Job, plan: StoredPlan, groups: Sequence[int]) -> list[str]:
+    """What of the sampler's work was skipped for these groups."""
+    if not groups:
+        return []
+    config, first = sampler_config(job), plan.groups[groups[0]]
+    full, scale = group_evaluations(job, first, config), config.guidance.scale
+    guided = full - config.steps
+    how = f"guided by {scale:g} in {guided} of them" if guided else "without guidance"
+    out = [f"{full} evaluations of the network a group: {config.steps} steps of {config.solver}, {how}."]
+    if scale != 1 and guided < config.steps:
+        out.append(
+            f"Skipped the unconditional half in {config.steps - guided} steps: guidance is on at log-SNR from "
+            f"{config.guidance.low_log_snr:g} to {config.guidance.high_log_snr:g}."
+        )
+    near = [c for g in groups if (c := group_sampler(job, plan, plan.groups[g])) != config]
+    if near:
+        saved = sum(full - group_evaluations(job, first, c) for c in near)
+        out.append(
+            f"{len(near)} of {len(groups)} groups are nearer than {NEAR:g} to a captured view and took "
+            f"{near[0].steps} steps: {saved} of {full * len(groups)} evaluations were saved."
+        )
+    return out
+
+
 def work(job: Job, store: SceneStore, key: str, items: Sequence[int]) -> None:
     """A worker's share: sample the groups `items`, in order, and store the views of each as soon as they are there."""
     run = store.run(job.run)
     plan = StoredPlan(store, run, job.config.seed)
     keys = view_keys(key, len(plan))
-    model, config = shared_model(job), sampler_config(job)
+    model = shared_model(job)
     targets = [view for g in items for view in plan.groups[g].targets]
     missing = {v for v in targets if not is_done(run.generated, "done_latent", v, keys[v], "latent")}
     groups = [plan.groups[g] for g in items if missing.intersection(plan.groups[g].targets)]
     at_once = job.config.execution.groups_at_once
-    for chunk in alike(groups, at_once):
+    for config, chunk in alike([(group_sampler(job, plan, group), group) for group in groups], at_once):
         tensors = network_inputs(plan, chunk, latent_shape(job))
         latents, at_once = sample_at_most(at_once, model, tensors, config)
         for group, made in zip(chunk, latents.cpu(), strict=True):
@@ -70,16 +134,17 @@ def work(job: Job, store: SceneStore, key: str, items: Sequence[int]) -> None:
             run.generated.mark_done("done_latent", [keys[v] for v in views], views)
 
 
-def alike(groups: Sequence[Group], at_once: int) -> list[list[Group]]:
-    """Successive runs of at most `at_once` groups with equal numbers of conditioning and target views."""
-    chunks: list[list[Group]] = []
+def alike(groups: Sequence[tuple[SamplerConfig, Group]], at_once: int) -> list[tuple[SamplerConfig, list[Group]]]:
+    """Successive runs of at most `at_once` groups with one sampler and equal numbers of conditioning and target
+    views."""
+    chunks: list[tuple[SamplerConfig, list[Group]]] = []
     last = None
-    for group in groups:
-        shape = len(group.conditions), len(group.targets)
-        if shape == last and len(chunks[-1]) < at_once:
-            chunks[-1].append(group)
+    for config, group in groups:
+        shape = config, len(group.conditions), len(group.targets)
+        if shape == last and len(chunks[-1][1]) < at_once:
+            chunks[-1][1].append(group)
         else:
-            chunks.append([group])
+            chunks.append((config, [group]))
         last = shape
     return chunks
 

@@ -62,7 +62,7 @@ def test_photos_in_generated_views_field_and_renders_out(model: Path, tmp_path: 
 def test_the_plan_is_printed_drawn_and_stored_before_anything_is_sampled(model: Path, tmp_path: Path, capfd) -> None:
     from flows.plan_command import plan_command
 
-    settings = [f"sample.checkpoint={model}"]
+    settings = [f"sample.checkpoint={model}", "skip=none"]
     given = {"trajectory": "single_orbit", "count": 20}
     (job,) = plan_command(SCENE, tmp_path, ["1"], given, settings=settings)
     printed = " ".join(capfd.readouterr().out.split())

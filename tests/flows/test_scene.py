@@ -210,7 +210,7 @@ def test_auto_generates_views_for_a_single_photo_only(tmp_path: Path) -> None:
 
 def test_the_sampler_is_the_runs_own_else_the_models_else_the_measured_default(tmp_path: Path) -> None:
     from cat3d_core.diffusion import SIZES, MultiViewModel, save_model
-    from flows.sampling.model import SAMPLER_DEFAULT, sampler_settings
+    from flows.sampling.model import PAPER_SAMPLER, SAMPLER_DEFAULT, sampler_settings
 
     advice = {"solver": "ddim", "nodes": "trailing", "steps": 4, "guidance": 1.0}
     for name, provenance in {"plain": {}, "advised": {"sampler": advice}}.items():
@@ -220,6 +220,10 @@ def test_the_sampler_is_the_runs_own_else_the_models_else_the_measured_default(t
         given = {"method": "cat3d", "model": str(tmp_path / f"{name}.safetensors")}
         return sampler_settings(make_jobs(SCENE, tmp_path, ["3"], make_config(given, None, settings))[1][0])
 
-    assert chosen("plain") == SAMPLER_DEFAULT
-    assert chosen("advised") == advice
-    assert chosen("advised", "sample.steps=9") == advice | {"steps": 9}
+    skipped = {"guidance_log_snr": [None, 2.0], "near_steps": False}
+    assert chosen("plain") == SAMPLER_DEFAULT | skipped
+    assert chosen("advised") == advice | skipped
+    assert chosen("advised", "sample.steps=9") == advice | {"steps": 9} | skipped
+    everything = {"guidance_log_snr": [None, None], "near_steps": False}
+    assert chosen("plain", "skip=none") == PAPER_SAMPLER | everything
+    assert chosen("plain", "skip=none", "sample.guidance_log_snr=[-5, 2]") == PAPER_SAMPLER | everything

@@ -11,6 +11,7 @@ from flows.sampling import fan_out as fan_out_module
 from flows.sampling.executors import open_executor
 from flows.sampling.fan_out import fan_out
 from flows.sampling.groups import StoredPlan
+from flows.sampling.model import sampler_config
 from flows.sampling.shrinking import sample_at_most
 from flows.sampling.work import Answer, Batch, WorkerError, run_batch
 from flows.stages import sample as sample_stage
@@ -174,12 +175,12 @@ def test_several_scenes_share_the_workers(scene, expected) -> None:
 def test_out_of_memory_halves_the_batch_and_gives_the_same_result(scene, monkeypatch) -> None:
     """The allocator's error is raised by hand where more than one group is evaluated; the rest is real."""
     from flows.sampling import shrinking
-    from flows.sampling.model import sampler_config, shared_model
+    from flows.sampling.model import shared_model
 
     job = scene()
     store = SceneStore.open(job.store_path)
     plan = StoredPlan(store, store.run(job.run), job.config.seed)
-    tensors = network_inputs(plan, alike(plan.groups, 4)[0], (8, 8, 8))
+    tensors = network_inputs(plan, alike([(sampler_config(job), g) for g in plan.groups], 4)[0][1], (8, 8, 8))
     model, config, real = shared_model(job), sampler_config(job), shrinking.sample
     alone, _ = sample_at_most(1, model, tensors, config)
     together, held = sample_at_most(4, model, tensors, config)
@@ -206,7 +207,7 @@ def test_groups_of_different_shapes_are_never_evaluated_together(scene) -> None:
     job = scene("1")
     store = SceneStore.open(job.store_path)
     plan = StoredPlan(store, store.run(job.run), 0)
-    chunks = alike(plan.groups, 3)
+    chunks = [chunk for _, chunk in alike([(sampler_config(job), g) for g in plan.groups], 3)]
     assert [g for chunk in chunks for g in chunk] == plan.groups
     assert all(len({(len(g.conditions), len(g.targets)) for g in chunk}) == 1 for chunk in chunks)
     assert max(map(len, chunks)) <= 3
