@@ -213,7 +213,9 @@ def _changed(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
 
 def capture_digests(capture: Capture) -> dict[str, Any]:
     """Digests of what a capture brings: "images" {name: sha256}, "lens" (intrinsics, distortion, masks), "cameras"."""
-    if capture.images is not None:
+    if capture.image_digests is not None:
+        images = dict(zip(capture.names, capture.image_digests))
+    elif capture.images is not None:
         images = {name: array_digest(image) for name, image in zip(capture.names, capture.images)}
     else:
         images = {name: file_sha256(path) for name, path in zip(capture.names, capture.paths)}

@@ -186,6 +186,26 @@ def _candidates(name: str) -> Iterator[Path]:
         yield from sorted(p for p in folder.glob(pattern) if p.suffix in (".safetensors", ".pth", ".pt"))
 
 
+def _located(name: str | None) -> tuple[str, Path] | None:
+    """Name and file of the network that `find_perceptual` loads."""
+    if name is not None and name not in ARCHITECTURES:
+        raise ValueError(f"There is no perceptual network '{name}'; choose one of {', '.join(ARCHITECTURES)}.")
+    given = os.environ.get("CAT3D_LPIPS_WEIGHTS")
+    if given and not Path(given).is_dir():
+        try:
+            found = load_perceptual(given).name
+        except ValueError as error:
+            raise ValueError(f"CAT3D_LPIPS_WEIGHTS: {error}") from error
+        if name in (None, found):
+            return found, Path(given)
+    for wanted in ARCHITECTURES if name is None else (name,):
+        if wanted in _BACKBONE_FILES and find_linear_weights(wanted) is None:
+            continue
+        for path in _candidates(wanted):
+            return wanted, path
+    return None
+
+
 def find_perceptual(name: str | None = None) -> PerceptualDistance | None:
     """The best perceptual distance whose weights are on this machine, or None; `.name` says which it is.
 
@@ -194,19 +214,11 @@ def find_perceptual(name: str | None = None) -> PerceptualDistance | None:
     use), lpips-alex, lpips-squeeze, st-lpips-alex, st-lpips-vgg (the larger ST network is asked for by name).
     Raises ValueError for an unknown name, or where the variable names something that can't be used.
     """
-    if name is not None and name not in ARCHITECTURES:
-        raise ValueError(f"There is no perceptual network '{name}'; choose one of {', '.join(ARCHITECTURES)}.")
-    given = os.environ.get("CAT3D_LPIPS_WEIGHTS")
-    if given and not Path(given).is_dir():
-        try:
-            distance = load_perceptual(given)
-        except ValueError as error:
-            raise ValueError(f"CAT3D_LPIPS_WEIGHTS: {error}") from error
-        if name in (None, distance.name):
-            return distance
-    for wanted in ARCHITECTURES if name is None else (name,):
-        if wanted in _BACKBONE_FILES and find_linear_weights(wanted) is None:
-            continue
-        for path in _candidates(wanted):
-            return load_perceptual(path)
-    return None
+    located = _located(name)
+    return load_perceptual(located[1]) if located else None
+
+
+def perceptual_name(name: str | None = None) -> str | None:
+    """The name of what `find_perceptual` finds, without loading it where the place tells."""
+    located = _located(name)
+    return located[0] if located else None

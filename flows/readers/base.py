@@ -44,7 +44,8 @@ class Capture:
     """One scene as a reader found it; N views in sorted order of their file names.
 
     names (N), unique, as the data set calls them; paths (N) to image files, or images (N arrays (H, W, 3) uint8) where
-    nothing lies on disk (procedural scenes).
+    nothing lies on disk (procedural scenes); image_digests (N): what stands for those arrays in content keys, where it
+    is known without them.
     cameras: OpenCV axes, float64, in the data set's own world frame; K and size belong to the image FILE as decoded
     and turned upright by its EXIF orientation, before undistortion. None where the poses must be estimated.
     distortion (N, 5): k1, k2, p1, p2, k3 in OpenCV's order and meaning, or None where there is none.
@@ -59,13 +60,14 @@ class Capture:
     dataset: str
     names: list[str]
     paths: list[Path] = field(default_factory=list)
-    images: list[np.ndarray] | None = None
+    images: Sequence[np.ndarray] | None = None
+    image_digests: list[str] | None = None
     cameras: Cameras | None = None
     distortion: Tensor | None = None
     masks: list[Path | None] = field(default_factory=list)
     points: Tensor | None = None
     depth_bounds: Tensor | None = None
-    depths: list[np.ndarray] | None = None
+    depths: Sequence[np.ndarray] | None = None
     splits: dict[str, dict[str, list[int]]] = field(default_factory=dict)
     missing: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -255,6 +256,18 @@ def test_procedural_images_match_their_cameras():
     assert capture.cameras.size.tolist() == [[24, 16]] * 4
     again = read_capture("procedural:dtu/2?views=4&width=24&height=16")
     assert all(np.array_equal(a, b) for a, b in zip(capture.images, again.images, strict=True))
+    assert capture.images[1:3][0] is capture.images[1]
+    assert [d.shape for d in capture.depths] == [(16, 24)] * 4
+
+
+def test_procedural_views_are_known_without_rendering_them(monkeypatch):
+    from flows.jobs import capture_digests
+
+    monkeypatch.setattr("flows.readers.procedural.trace", None)
+    one, other = (read_capture(f"procedural:dtu/{seed}?views=4&width=24&height=16") for seed in (51, 52))
+    digests = [*capture_digests(one)["images"].values(), *capture_digests(other)["images"].values()]
+    assert len(set(digests)) == 8
+    assert all(re.fullmatch("[0-9a-f]{64}", digest) for digest in digests)
 
 
 def test_linspace_rule_matches_the_published_llff_splits(shared_data):
