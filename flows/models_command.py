@@ -25,7 +25,7 @@ def models_command(describe_size: str | None, model: Path | None, as_json: bool)
         print(json.dumps(reports, indent=1))
         return
     if not reports:
-        console.print("No model is installed; train one with infra/train_default.py or `cat3d train`.")
+        console.print("No model is installed; train one with `cat3d train`.")
     for report in reports:
         console.print(_pairs(report, report["path"]))
 

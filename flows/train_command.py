@@ -16,7 +16,7 @@ from flows.progress import console
 from flows.readers.base import InputError
 from flows.run_command import settings_document
 from flows.training.loop import MODEL, SHEETS, STATE, TABLES, train
-from flows.training.model import model_config, starting_config, starting_model
+from flows.training.model import history, model_config, starting_config, starting_model
 from flows.training.prepare import claim, prepare
 from flows.training.ranks import Ranks, ranks
 from flows.training.sheets import held_out
@@ -87,6 +87,8 @@ def run_training(config: TrainRunConfig, out: Path, own: Ranks) -> None:
         + (f", textures from {textures.name}" if textures else ""),
         "training": json.loads(config.model_dump_json()), "versions": provenance(), "ranks": own.world,
     }  # fmt: skip
+    if config.start is not None:
+        origin["started_from"] = history(config.start)
     train(config, out, model, bank, scenes, own, origin)
     if own.first:
         _summary(out, time.monotonic() - started)

@@ -160,14 +160,10 @@ class TransformerBlock(nn.Module):
         self.norm3 = nn.LayerNorm(channels)
         self.ff = FeedForward(channels)
 
-    def forward(
-        self, tokens: Tensor, views: int, context: Tensor | None, frames: ViewFrames | None = None
-    ) -> Tensor:
+    def forward(self, tokens: Tensor, views: int, context: Tensor | None, frames: ViewFrames | None = None) -> Tensor:
         """tokens [G*V, L, C], context [G*V, 1, C'] -> [G*V, L, C]. `frames` are for 3D attention."""
         mode: ViewAttention = "none" if self.mode == "temporal" else self.mode
-        tokens = tokens + self._attend(
-            self.attn1, self.norm1(tokens), views, mode, frames if mode == "3d" else None
-        )
+        tokens = tokens + self._attend(self.attn1, self.norm1(tokens), views, mode, frames if mode == "3d" else None)
         if self.mode == "temporal":
             tokens = tokens + self._attend(self.attn_views, self.norm_views(tokens), views, "temporal")
         if context is not None:

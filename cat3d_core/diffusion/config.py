@@ -36,7 +36,8 @@ class UNetConfig:
     decoder_only: views meet in the middle and the up path only.
     camera: "raymap" concatenates 6 ray channels; "vector" feeds 8 numbers per view through cross-attention.
     ray_octaves: sines and cosines of the ray channels at this many octaves are concatenated too (0: the rays alone).
-    relative_cameras: 3D attention carries its vectors from camera to camera (`ViewFrames`; not in the paper). No weights.
+    relative_cameras: 3D attention carries its vectors from camera to camera (attention.ViewFrames): not in the paper,
+    and without weights of its own.
     """
 
     latent_channels: int = 8
@@ -68,7 +69,7 @@ class UNetConfig:
                 )
             if self.relative_cameras and channels // heads % 8:
                 raise ValueError(
-                    f"relative_cameras needs heads of a multiple of 8 channels, and {channels} channels on {heads} heads "
+                    f"relative_cameras needs heads of a multiple of 8 channels; {channels} channels on {heads} heads "
                     f"are {channels // heads} each."
                 )
 

@@ -11,6 +11,6 @@ def default_model_path() -> Path:
     if not path.is_file():
         raise FileNotFoundError(
             f"This installation carries no default model ({path} is missing): install the package again, train one "
-            "with infra/train_default.py, or name a model file."
+            "with `cat3d train default`, or name a model file."
         )
     return path

@@ -166,7 +166,10 @@ def model_rows(quick: bool, data: Path | None) -> list[Row]:
     path = _model_file()
     chosen = SAMPLER_DEFAULT | describe(path)["provenance"].get("sampler", {})
     config = SamplerConfig(chosen["solver"], chosen["nodes"], chosen["steps"], GuidanceConfig(chosen["guidance"]))
-    rows = model.rows(load_model(path), 1 if quick else 20, (3,) if quick else (3, 1), config, find_perceptual())
+    rows = model.rows(
+        load_model(path), 1 if quick else 20, (3,) if quick else (3, 1), config, find_perceptual(),
+        captured=model.captured_scenes(data),
+    )  # fmt: skip
     return [row | {name: chosen[name] for name in SAMPLER_DEFAULT} for row in rows]
 
 

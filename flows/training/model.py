@@ -60,6 +60,17 @@ def starting_model(config: ModelConfig, autoencoder: Autoencoder, start: Path | 
     return model
 
 
+def history(start: Path) -> dict[str, Any]:
+    """What is to be remembered of the weights that a training starts from: which they are, and what they had seen."""
+    if not _is_ours(start):
+        return {"file": start.name}
+    from cat3d_core.diffusion import describe
+
+    facts = describe(start)
+    kept = ("steps", "groups_of_views", "groups_of_8_views", "hours", "started_from")
+    return {"sha256": facts.get("sha256")} | {k: facts["provenance"][k] for k in kept if k in facts["provenance"]}
+
+
 def _is_ours(path: Path) -> bool:
     if not path.is_file():
         return False

@@ -6,7 +6,15 @@ import torch
 from cat3d_core.diffusion import SIZES, GuidanceConfig, MultiViewModel, SamplerConfig
 from cat3d_core.metrics.psnr import psnr
 from cat3d_core.synthetic import FAMILIES
-from flows.bench.model import camera_distance, held_out_group, rows, table, warp
+from flows.bench.model import (
+    ALL_CAPTURED,
+    camera_distance,
+    captured_group,
+    held_out_group,
+    rows,
+    table,
+    warp,
+)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -34,3 +42,20 @@ def test_rows_of_an_untrained_model():
     assert len(result) == 4 * (len(FAMILIES) + 1)
     assert {r["scenes"] for r in result if r["family"] == "all"} == {len(FAMILIES)}
     assert "| 3 | all |" in table(result)
+
+
+def test_captured_scenes_are_scored_beside_the_procedural_ones(shared_data):
+    """Training views of the split first; the cameras see the same points as in the full photographs."""
+    images, cameras = captured_group(shared_data / "llff_fern", 64, 3)
+    assert images.shape == (3 + 3, 3, 64, 64)  # fern has three test views
+    assert (cameras.size == 64).all()
+    # The scene is normalised: the axes' common point, at mean distance about 1, lies in the middle of each square.
+    pixels, depth = cameras.project(torch.zeros(1, 3, dtype=torch.float64))
+    assert (depth > 0.3).all()
+    assert (pixels - 32).abs().max() < 24
+    model = MultiViewModel(SIZES["tiny"]).eval()
+    sampler = SamplerConfig(steps=1, guidance=GuidanceConfig(scale=1.0))
+    result = rows(model, 0, (3,), sampler, captured=[shared_data / "llff_fern"])
+    assert {r["family"] for r in result} == {"llff_fern", ALL_CAPTURED}
+    assert {r["method"] for r in result} == {"sample", "nearest", "autoencoder"}
+    assert f"| 3 | {ALL_CAPTURED} |" in table(result)
