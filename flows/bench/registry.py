@@ -7,6 +7,7 @@ benchmark set a cost against an error or a quality: the front is worth choosing 
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ from flows.bench import metrics, model, plan, poses, reconstruct, sampler, store
 from flows.images import read_image
 from flows.readers import read_capture
 from flows.readers.base import InputError
-from flows.sampling.model import SAMPLER_DEFAULT
+from flows.sampling.model import GUIDANCE_INTERVAL, SAMPLER_DEFAULT
 from schemas.config import PosesConfig, ReconstructConfig, SampleConfig
 
 Row = dict[str, Any]
@@ -89,12 +90,14 @@ def _scenes(data: Path | None, names: list[str]) -> list[Path]:
 def sampler_rows(quick: bool, data: Path | None) -> list[Row]:
     """The closed-form mixture, and in full also the shipped model where there is one."""
     chosen = {n: SAMPLER_DEFAULT[n] for n in ("solver", "nodes", "steps")} | {"dtype": SampleConfig().precision}
-    steps = tuple(sorted({10, 20, 50, SAMPLER_DEFAULT["steps"]} | (set() if quick else {15, 30})))
+    steps = tuple(sorted({8, 10, 20, 50, SAMPLER_DEFAULT["steps"]} | (set() if quick else {12, 15, 30})))
     rows = sampler.rows(None, steps, groups=8 if quick else 64)
     if not quick:
         with contextlib.suppress(MissingError):
             rows += sampler.rows(_model_file(), steps)
-    return _marked(rows, chosen | {"interval": "all", "problem": "mixture"})  # a model's file has its own default
+    bounds = tuple(math.copysign(math.inf, i - 0.5) if b is None else b for i, b in enumerate(GUIDANCE_INTERVAL))
+    interval = next(name for name, found in sampler.INTERVALS.items() if found == bounds)
+    return _marked(rows, chosen | {"interval": interval, "problem": "mixture"})  # a model's file has its own default
 
 
 def reconstruct_rows(quick: bool, data: Path | None) -> list[Row]:
@@ -183,8 +186,8 @@ BENCHES: dict[str, Bench] = {
         "solvers, noise levels, steps, guidance interval and number format against a 1,000-step float64 reference",
         sampler_rows,
         (
-            Panel("Sampler, closed-form mixture", "evaluations", "error", where=(("problem", "mixture"),),
-                  **_SAMPLER_POINT),  # type: ignore[arg-type]
+            Panel("Sampler, closed-form mixture, against guidance everywhere", "evaluations", "error_guided_p90",
+                  ("solver", "nodes"), ("steps", "interval", "dtype"), where=(("problem", "mixture"),)),
             Panel("Sampler, shipped model", "seconds", "error", where=(("problem", "model"),),
                   **_SAMPLER_POINT),  # type: ignore[arg-type]
         ),
