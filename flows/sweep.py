@@ -1,24 +1,15 @@
-"""`cat3d sweep`: scenes x splits x methods x seeds as one Prefect flow, fanned out over scenes."""
+"""`cat3d sweep`: what a sweep consists of and what of it is to do. Its flow is in `flows/sweep_flow.py`."""
 
 from __future__ import annotations
 
 import json
 import os
 import string
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import Any
 
-from prefect import flow, task
-from prefect.cache_policies import NO_CACHE
-from prefect.task_runners import ProcessPoolTaskRunner
-
-from flows.errors import describe
 from flows.jobs import Job, capture_digests, expected_steps, make_jobs, pending
 from flows.progress import console
 from flows.readers.base import InputError
-from flows.scene import run_jobs
 from schemas.config import SweepConfig, merged, parse_config
 from schemas.errors import ConfigError
 
@@ -62,49 +53,9 @@ def open_jobs(jobs: list[Job]) -> list[Job]:
     return [job for job in jobs if pending(job, expected_steps(job, capture, digests))]
 
 
-@task(cache_policy=NO_CACHE, task_run_name="{scene_id}")
-def run_scene(scene_id: str, jobs: list[dict[str, Any]]) -> dict[str, str]:
-    """All open jobs of one scene. A failure that a user can act on comes back as {run: sentence}."""
-    problems = {}
-    for document in jobs:
-        job = Job.model_validate(document)
-        try:
-            run_jobs([job])
-        except Exception as error:
-            sentence = describe(error)
-            if sentence is None:
-                raise
-            problems[job.run] = f"{scene_id} {job.run}: {sentence}"
-        from flows.report import write_report
-
-        write_report(job.out)  # partial results at once
-    return problems
-
-
-@flow(name="cat3d-sweep", validate_parameters=False)
-def _sweep(scenes: list[list[dict[str, Any]]], workers: int) -> list[str]:
-    """One task a scene. With one worker in this very thread, so that Ctrl-C and SIGTERM stop it at once."""
-    calls: list[tuple[str, Callable[[], dict[str, str]]]] = []
-    for jobs in scenes:
-        scene_id = jobs[0]["scene_id"]
-        if workers > 1:
-            calls.append((scene_id, run_scene.submit(scene_id, jobs).result))
-        else:
-            calls.append((scene_id, partial(run_scene, scene_id, jobs)))
-    problems: list[str] = []
-    for scene_id, call in calls:
-        try:
-            problems += call().values()
-        except Exception as error:
-            problems.append(f"{scene_id}: failed with {type(error).__name__}: {error}")
-    return problems
-
-
 def run_sweep(config: SweepConfig, out: Path) -> list[str]:
     """Do what is missing of a sweep. Returns a sentence per failure; results of the others stand."""
     from flows.report import write_report
-    from flows.sampling.ahead import sample_ahead
-    from flows.server import prefect_server
 
     out = out.resolve()
     scenes, problems = sweep_jobs(config, out)
@@ -114,11 +65,12 @@ def run_sweep(config: SweepConfig, out: Path) -> list[str]:
     out.mkdir(parents=True, exist_ok=True)
     (out / "sweep.json").write_text(json.dumps(config.model_dump(mode="json"), indent=1))
     if todo:
-        runner: Any = ProcessPoolTaskRunner(config.workers)
+        # Only here: importing Prefect would be half the time of a sweep in which nothing is to do.
+        from flows.server import prefect_server
+        from flows.sweep_flow import sweep_flow
+
         with prefect_server(out / ".prefect"):
-            sample_ahead([job for jobs in todo for job in jobs])
-            documents = [[job.model_dump(mode="json") for job in jobs] for jobs in todo]
-            problems += _sweep.with_options(task_runner=runner)(documents, config.workers)
+            problems += sweep_flow(todo, config.workers)
     page = write_report(out, only_if_changed=not todo)
     console.print(f"Report: {page}")
     return problems
