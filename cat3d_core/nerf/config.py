@@ -95,16 +95,29 @@ class ReconstructConfig:
     view_degree: int = 4
     rgb_padding: float = 1e-3
 
-    # Speed (measured in `cat3d bench reconstruct`)
+    # Skips: each costs or changes nothing at its default (measured in `cat3d bench reconstruct`)
     proposal_every: int = 1
     """Train the proposals at every k-th step (after warm-up); 1 as in Zip-NeRF."""
+    lpips_every: int = 1
+    """Draw patches for the perceptual loss at every k-th step only, its weight times k there; 1 as in CAT3D."""
     low_resolution_iterations: int = 0
-    """Start on images of half the size for this many steps."""
+    """Start on images of half the size for this many steps, without patches."""
+    skip_transmittance: float = 0.0
+    """Go along rays from front to back and do not query what less than this share of the light reaches: it adds at
+    most that to a colour. In training in the final round only (and in proposals at steps that don't train them, see
+    proposal_every), in renderings in all. 0: all is queried."""
+    skip_groups: int = 4
+    """Groups of intervals in which it then goes along."""
     plateau_patience: int = 0
-    """`Trainer.finished` early once the error of held-out pixels has not fallen for this many checks; 0: never."""
+    """The schedule is cut short once this many checks in a row saw no lower error of held-out pixels; 0: never."""
     plateau_every: int = 50
     plateau_pixels: int = 1024
     """Pixels of captured views that are then not trained on, drawn once; checked every plateau_every steps."""
+    plateau_tolerance: float = 0.01
+    """Share by which the error has to fall below the lowest so far to count; less is noise."""
+    plateau_cooldown: float = 0.1
+    """Share of `iterations` in which what is left of the schedule is then run through: without the fall of the
+    learning rate a field stays noisy. 0: training stops at once."""
 
     def __post_init__(self) -> None:
         rounds = len(self.samples)
@@ -118,8 +131,12 @@ class ReconstructConfig:
             raise ValueError("patch_share and captured_share lie in [0, 1].")
         if not 0.0 < self.lr_final <= self.lr_init:
             raise ValueError("The learning rate falls: 0 < lr_final <= lr_init.")
-        if self.proposal_every < 1 or self.plateau_every < 1:
-            raise ValueError("proposal_every and plateau_every are at least 1.")
+        if min(self.proposal_every, self.lpips_every, self.plateau_every, self.skip_groups) < 1:
+            raise ValueError("proposal_every, lpips_every, plateau_every and skip_groups are at least 1.")
+        if not all(0.0 <= x < 1.0 for x in (self.skip_transmittance, self.plateau_tolerance)):
+            raise ValueError("skip_transmittance and plateau_tolerance lie in [0, 1).")
+        if not 0.0 <= self.plateau_cooldown <= 1.0:
+            raise ValueError("plateau_cooldown lies in [0, 1].")
 
     @property
     def rounds(self) -> int:

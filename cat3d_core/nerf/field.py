@@ -11,10 +11,8 @@ from torch import Tensor, nn
 
 from cat3d_core.nerf.config import ReconstructConfig
 from cat3d_core.nerf.coordinates import contract, contracted_std
-from cat3d_core.nerf.frustums import cone_samples
 from cat3d_core.nerf.hash_grid import make_layout, query
 from cat3d_core.random import generator
-from cat3d_core.rays import Rays
 
 _LOG_DENSITY_MAX = 40.0  # e^40 * 1e6 is far below the float32 maximum: optical depths stay finite
 
@@ -138,12 +136,3 @@ class Field(nn.Module):
         except RuntimeError as error:
             raise ValueError(f"The stored field does not fit this reconstruction config: {error}") from error
         return field
-
-    def density(
-        self, round_index: int, rays: Rays, t: Tensor, multisamples: int, generator: torch.Generator | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Density (R, N) per unit length and hidden units (R, N, width) of the intervals with edges t (R, N+1)."""
-        with torch.no_grad():
-            means, std = cone_samples(*rays, t, multisamples, generator)
-        density, hidden = self.grids[round_index](means, std)
-        return density, hidden

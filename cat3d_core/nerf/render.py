@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,7 +15,8 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.nerf import stepfun
 from cat3d_core.nerf.config import ReconstructConfig
 from cat3d_core.nerf.coordinates import t_from_s
-from cat3d_core.nerf.field import Field
+from cat3d_core.nerf.field import Field, GridDensity
+from cat3d_core.nerf.frustums import cone_samples
 from cat3d_core.rays import Rays, image_rays
 
 
@@ -47,14 +51,73 @@ class Render:
     normals: Tensor
 
 
+class Part(NamedTuple):
+    """Intervals that were queried together: `rows` of the rays (None: all), a range of intervals, their hidden units
+    (rows, range, width)."""
+
+    rows: Tensor | None
+    intervals: slice
+    hidden: Tensor
+
+
+def _lengths(t: Tensor, directions: Tensor) -> Tensor:
+    """Lengths (R, n) of intervals with edges t (R, n+1) along directions (R, 3) of any length."""
+    return (t[..., 1:] - t[..., :-1]) * directions.norm(dim=-1, keepdim=True)
+
+
 def weights_from_density(density: Tensor, t: Tensor, directions: Tensor) -> Tensor:
     """Compositing weights (R, n) = alpha * transmittance of intervals with edges t (R, n+1) along directions (R, 3).
 
     alpha = -expm1(-optical depth): 1 - exp(-x) would lose thin fog (all of it at 1e-8) in float32.
     """
-    depth = density * ((t[..., 1:] - t[..., :-1]) * directions.norm(dim=-1, keepdim=True))
+    depth = density * _lengths(t, directions)
     before = torch.cat([torch.zeros_like(depth[..., :1]), depth[..., :-1].cumsum(-1)], -1)
     return -torch.expm1(-depth) * torch.exp(-before)
+
+
+def _spread(values: Tensor, rows: Tensor | None, count: int) -> Tensor:
+    """`values` (K, ...) of the given rays among `count`; the others get 0."""
+    return values if rows is None else values.new_zeros((count, *values.shape[1:])).index_put((rows,), values)
+
+
+def query_rays(
+    grid: GridDensity, means: Tensor, std: Tensor, lengths: Tensor, bound: float, groups: int
+) -> tuple[Tensor, list[Part]]:
+    """Density (R, N) of intervals with these samples (R, N, S, 3), (R, N, S) and lengths (R, N), and what was queried.
+
+    bound > 0: goes from front to back in `groups` and leaves rays out once less than this share of their light is
+    left; density is 0 there. The colour and, since every gradient behind is scaled by the light that is left, its
+    gradients change by at most that share.
+    """
+    count, intervals = lengths.shape
+    if not bound:
+        density, hidden = grid(means, std)
+        return density, [Part(None, slice(None), hidden)]
+    edges = [round(intervals * i / groups) for i in range(groups + 1)]
+    depth, rows = torch.zeros_like(lengths[:, 0]), None
+    densities, parts = [], []
+    for first, last in itertools.pairwise(edges):
+        part = slice(first, last)
+        if first:
+            rows = (depth < -math.log(bound)).nonzero()[:, 0]
+            if not len(rows):
+                densities.append(torch.zeros_like(lengths[:, first:]))
+                break
+        density, hidden = grid(*(x[:, part] if rows is None else x[rows, part] for x in (means, std)))
+        densities.append(_spread(density, rows, count))
+        parts.append(Part(rows, part, hidden))
+        depth = depth + (densities[-1].detach() * lengths[:, part]).sum(1)
+    return torch.cat(densities, 1), parts
+
+
+def composite(field: Field, directions: Tensor, weights: Tensor, parts: list[Part]) -> Tensor:
+    """rgb (R, 3): the colours of the queried intervals, weighted (R, N)."""
+    colours = []
+    for rows, intervals, hidden in parts:
+        seen = slice(None) if rows is None else rows
+        colour = field.colour(hidden, directions[seen])
+        colours.append(_spread((weights[seen, intervals, None] * colour).sum(1), rows, len(weights)))
+    return colours[0] if len(colours) == 1 else torch.stack(colours).sum(0)
 
 
 def render_rays(
@@ -74,19 +137,24 @@ def render_rays(
     count = len(rays.origins)
     s = torch.tensor([0.0, 1.0], device=rays.origins.device).expand(count, 2)
     logits = torch.zeros_like(s[:, :1])
-    rounds = []
-    hidden = logits
+    rounds: list[Round] = []
+    parts: list[Part] = []
     for index, samples in enumerate(config.samples):
         s = stepfun.sample_intervals(s, logits, samples, generator)
         t = t_from_s(s, config.near, config.far, config.distance_power, config.distance_premult)
-        final = index == config.rounds - 1
-        with torch.set_grad_enabled(torch.is_grad_enabled() and (final or train_proposals)):
-            density, hidden = field.density(index, rays, t, config.multisamples, generator)
+        trained = torch.is_grad_enabled() and (train_proposals or index == config.rounds - 1)
+        # A proposal that trains has to be seen whole: where it is 0, its loss would be unbounded.
+        skip = 0.0 if trained and index < config.rounds - 1 else config.skip_transmittance
+        with torch.set_grad_enabled(trained):
+            with torch.no_grad():
+                means, std = cone_samples(*rays, t, config.multisamples, generator)
+            lengths = _lengths(t, rays.directions)
+            density, parts = query_rays(field.grids[index], means, std, lengths, skip, config.skip_groups)  # type: ignore[arg-type]
             weights = weights_from_density(density, t, rays.directions)
         rounds.append(Round(s, t, weights))
         # The smallest normal number, not 0: a ray without any weight keeps finite logits.
         logits = anneal * weights.detach().clamp_min(torch.finfo(weights.dtype).tiny).log()
-    rgb = (rounds[-1].weights[..., None] * field.colour(hidden, rays.directions)).sum(1)
+    rgb = composite(field, rays.directions, rounds[-1].weights, parts)
     opacity = rounds[-1].weights.sum(1)
     low, high = config.background
     if generator is None:

@@ -54,6 +54,7 @@ class Trainer:
         self.iteration = 0
         self.skipped = 0
         self.best_error, self.stale_checks = math.inf, 0
+        self.plateau_at = -1  # the iteration from which the schedule is cut short
         self._held_out: Batch | None = None
         if config.plateau_patience:
             generator = torch.Generator(self.device).manual_seed(derive_seed(seed, "nerf", "held out"))
@@ -62,22 +63,28 @@ class Trainer:
         self._coarse = self.views.halved() if config.low_resolution_iterations else None
 
     @property
-    def converged(self) -> bool:
-        """With `plateau_patience`: the error of the held-out pixels has stopped falling."""
-        return 0 < self.config.plateau_patience <= self.stale_checks
+    def progress(self) -> float:
+        """Position in the schedule, 0 to 1: the share of iterations done, quicker after a plateau."""
+        c = self.config
+        if self.plateau_at < 0:
+            return self.iteration / c.iterations
+        start, cooldown = self.plateau_at / c.iterations, c.plateau_cooldown * c.iterations
+        since = self.iteration - self.plateau_at
+        return start + (1.0 - start) * since / cooldown if since < cooldown else 1.0
 
     @property
     def finished(self) -> bool:
-        """All iterations done, or converged."""
-        return self.converged or self.iteration >= self.config.iterations
+        """The schedule is run through."""
+        return self.progress >= 1.0
 
-    def learning_rate(self, iteration: int) -> float:
-        """Logarithmic decay times Zip-NeRF's sine warm-up."""
+    def learning_rate(self) -> float:
+        """Logarithmic decay times Zip-NeRF's sine warm-up, for the next step."""
         c = self.config
-        progress = min(1.0, iteration / c.iterations)
+        progress = min(1.0, self.progress)
         lr = math.exp((1.0 - progress) * math.log(c.lr_init) + progress * math.log(c.lr_final))
-        if iteration < c.warmup_iterations:
-            lr *= c.warmup_scale + (1.0 - c.warmup_scale) * math.sin(0.5 * math.pi * iteration / c.warmup_iterations)
+        if self.iteration < c.warmup_iterations:
+            warm = math.sin(0.5 * math.pi * self.iteration / c.warmup_iterations)
+            lr *= c.warmup_scale + (1.0 - c.warmup_scale) * warm
         return lr
 
     def step(self) -> dict[str, float]:
@@ -87,7 +94,7 @@ class Trainer:
         `max_skipped_steps` of them, ValueError for views smaller than a patch.
         """
         c = self.config
-        progress = self.iteration / c.iterations
+        progress = self.progress
         generator = torch.Generator(self.device).manual_seed(derive_seed(self.seed, "nerf", "step", self.iteration))
         views = (
             self._coarse if self._coarse is not None and self.iteration < c.low_resolution_iterations else self.views
@@ -102,13 +109,14 @@ class Trainer:
             torch.stack([value for name, value in terms.items() if name != "mse"]).sum().backward()
             for name, value in terms.items():
                 totals[name] = totals.get(name, torch.zeros_like(value)) + value.detach()
-        lr = self.learning_rate(self.iteration)
+        lr = self.learning_rate()
         if self._finite(totals):
             self.adam.step(lr)
         else:
             self._skip(views, batches, totals)
         self.iteration += 1
-        if self._held_out is not None and self.iteration % c.plateau_every == 0:
+        settled = self.iteration > max(c.warmup_iterations, c.low_resolution_iterations)
+        if self._held_out is not None and settled and self.plateau_at < 0 and self.iteration % c.plateau_every == 0:
             self._check_plateau(self._held_out)
         result = {name: float(value) for name, value in totals.items()}
         mse = result.pop("mse")
@@ -118,7 +126,8 @@ class Trainer:
     def _draw(self, views: Views, generator: torch.Generator) -> list[Batch]:
         c = self.config
         patches = 0
-        if self.perceptual is not None and c.lpips_weight > 0.0 and c.patch_share > 0.0:
+        perceptual = self.perceptual is not None and c.lpips_weight > 0.0 and c.patch_share > 0.0
+        if perceptual and views is self.views and self.iteration % c.lpips_every == 0:
             patches = max(1, round(c.patch_share * c.batch_rays / c.patch_size**2))
         singles = max(0, c.batch_rays - patches * c.patch_size**2) if c.patch_share < 1.0 or not patches else 0
         batches = []
@@ -171,17 +180,21 @@ class Trainer:
                 (image * valid).view(shape).permute(0, 3, 1, 2).contiguous() for image in (out.rgb, batch.rgb)
             )
             distance = self.perceptual(prediction.clamp(0.0, 1.0), target)
-            terms["perceptual"] = (
-                c.lpips_weight * (distance * trust[batch.view[:: batch.patch**2]]).mean() * share["patches"]
-            )
+            mean = (distance * trust[batch.view[:: batch.patch**2]]).mean() * share["patches"]
+            terms["perceptual"] = c.lpips_every * c.lpips_weight * mean
         return terms
 
     @torch.no_grad()
     def _check_plateau(self, held_out: Batch) -> None:
         rays = pixel_rays(self.views.cameras, held_out.view, held_out.xy + 0.5)
         error = float((render_rays(self.field, rays).rgb - held_out.rgb).abs().mean())
-        self.stale_checks = 0 if error < self.best_error else self.stale_checks + 1
-        self.best_error = min(error, self.best_error)
+        # NaN compares as no progress: a field that broke does not hold training up.
+        if error < self.best_error * (1.0 - self.config.plateau_tolerance):
+            self.best_error, self.stale_checks = error, 0
+        else:
+            self.stale_checks += 1
+        if self.stale_checks >= self.config.plateau_patience:
+            self.plateau_at = self.iteration
 
     def _finite(self, totals: dict[str, Tensor]) -> bool:
         # Squared, as Adam will: a gradient beyond 1e19 would freeze its parameter with an infinite second moment.
@@ -218,6 +231,7 @@ class Trainer:
         state |= {
             "trainer.best_error": torch.tensor(self.best_error, dtype=torch.float64),
             "trainer.stale_checks": torch.tensor(self.stale_checks),
+            "trainer.plateau_at": torch.tensor(self.plateau_at),
         }
         return {name: value.detach().cpu().clone() for name, value in state.items()}
 
@@ -235,3 +249,4 @@ class Trainer:
         self.adam.load_state({n.removeprefix("adam."): v for n, v in state.items() if n.startswith("adam.")})
         self.iteration, self.skipped = int(state["trainer.iteration"]), int(state["trainer.skipped"])
         self.best_error, self.stale_checks = float(state["trainer.best_error"]), int(state["trainer.stale_checks"])
+        self.plateau_at = int(state["trainer.plateau_at"])
