@@ -9,18 +9,16 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import pickle
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from cat3d_core.metrics.backbones import ARCHITECTURES, build_features
 from cat3d_core.metrics.images import image_pair
+from cat3d_core.metrics.weights import read_tensors
 
 # Of torchvision's ImageNet statistics, for inputs in [-1, 1] (LPIPS v0.1's scaling layer).
 _SHIFT = (-0.030, -0.088, -0.188)
@@ -87,18 +85,6 @@ class PerceptualDistance(nn.Module):
         return torch.stack(layers).sum(dim=0)
 
 
-def _read_tensors(path: Path) -> dict[str, Tensor]:
-    if not path.is_file():
-        raise ValueError(f"{path}: there is no such file of weights.")
-    try:
-        state = load_file(path) if path.suffix == ".safetensors" else torch.load(path, "cpu", weights_only=True)
-    except (SafetensorError, pickle.UnpicklingError, RuntimeError, EOFError, ValueError, OSError) as error:
-        raise ValueError(f"{path}: not a readable file of plain tensors ({str(error).splitlines()[0]}).") from error
-    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
-        raise ValueError(f"{path}: expected a dictionary of tensors by name.")
-    return state
-
-
 def _recognise(state: dict[str, Tensor]) -> str | None:
     """Which network a state dictionary belongs to, by its key names."""
     first = state.get("net.slice1.0.weight", state.get("features.0.weight"))
@@ -138,7 +124,7 @@ def load_perceptual(path: str | Path, linear: str | Path | None = None) -> Perce
     torchmetrics), or an ST-LPIPS file, which is complete. Raises ValueError naming the file for anything else.
     """
     path = Path(path)
-    state = _read_tensors(path)
+    state = read_tensors(path)
     name = _recognise(state)
     if name is None:
         raise ValueError(
@@ -152,7 +138,7 @@ def load_perceptual(path: str | Path, linear: str | Path | None = None) -> Perce
                 f"{path}: a backbone alone; LPIPS also needs its linear weights. Install lpips or torchmetrics "
                 "(they carry them) or give their file."
             )
-        heads, heads_path = _read_tensors(found), found
+        heads, heads_path = read_tensors(found), found
     distance = PerceptualDistance(name)
     # ST-LPIPS files keep a layer's index but nest it in a slice: net.slice2.5.weight is layer 5's.
     layers = {re.sub(r"^(features|net\.slice\d+)\.", "", key): value for key, value in state.items()}
