@@ -185,6 +185,16 @@ class SkipConfig(_Model):
     solver: bool = True
     """Sample: steps beyond those a better solver needs for the error of the paper's 50 steps of DDIM. Models whose
     file recommends a sampler are sampled with that one either way."""
+    empty_space: bool = True
+    """Reconstruct, render: queries of the field behind what stops all but a hundredth of a ray's light."""
+    proposals: bool = True
+    """Reconstruct: training of the proposals at all but every fourth step."""
+    lpips: bool = True
+    """Reconstruct: the LPIPS loss at all but every fourth step."""
+    low_resolution: bool = True
+    """Reconstruct: full resolution in the first quarter of the steps."""
+    plateau: bool = True
+    """Reconstruct: what is left of the steps when held-out pixels no longer improve, but for a cool-down."""
     workers: bool = True
     """Sample, decode: worker processes for what this one has done before they would have started."""
 

@@ -29,8 +29,19 @@ STRONG_LPIPS = 4.0
 STRONG_LPIPS_DATASETS = ("co3d", "mip360", "mipnerf360")
 
 
+def skip_settings(iterations: int) -> dict[str, dict[str, Any]]:
+    """The trainer's settings that each switch of the configuration's section `skip` turns on."""
+    return {
+        "empty_space": {"skip_transmittance": 0.01},
+        "proposals": {"proposal_every": 4},
+        "lpips": {"lpips_every": 4},
+        "low_resolution": {"low_resolution_iterations": iterations // 4},
+        "plateau": {"plateau_patience": 3},
+    }
+
+
 def trainer_config(job: Job) -> ReconstructConfig:
-    """The preset with the method's and family's LPIPS weight and the run's overrides.
+    """The preset with the method's and family's LPIPS weight, what the run skips, and its overrides.
 
     Raises ConfigError naming a bad setting.
     """
@@ -42,6 +53,12 @@ def trainer_config(job: Job) -> ReconstructConfig:
         config = dataclasses.replace(config, lpips_weight=0.0)
     elif job.dataset in STRONG_LPIPS_DATASETS:
         config = dataclasses.replace(config, lpips_weight=STRONG_LPIPS * config.lpips_weight)
+    iterations = settings.overrides.get("iterations", config.iterations)
+    off = ReconstructConfig()  # as in the paper: nothing is skipped
+    for name, changes in skip_settings(iterations if isinstance(iterations, int) else config.iterations).items():
+        on = getattr(job.config.skip, name)
+        chosen = {n: value if on else getattr(off, n) for n, value in changes.items()}
+        config = dataclasses.replace(config, **chosen)
     known = {f.name for f in dataclasses.fields(ReconstructConfig)}
     unknown = sorted(set(settings.overrides) - known)
     if unknown:
@@ -101,14 +118,32 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
             if time.monotonic() - saved > CHECKPOINT_INTERVAL_S:
                 checkpoint.save(trainer)
                 saved = time.monotonic()
-    if trainer.iteration < config.iterations:
-        decisions.append(f"Stopped early at iteration {trainer.iteration}: the held-out loss no longer improved.")
+    decisions += skip_decisions(trainer)
     if trainer.skipped:
         decisions.append(f"{trainer.skipped} steps with a non-finite loss or gradient were skipped.")
     write_field(run, trainer.field, record)
     checkpoint.remove()
     rays = (trainer.iteration - resumed) * config.batch_rays
     return Outcome({"views": len(views), "steps": trainer.iteration - resumed, "rays": rays}, decisions)
+
+
+def skip_decisions(trainer: Trainer) -> list[str]:
+    """What the training did without."""
+    config, steps, out = trainer.config, trainer.iteration, []
+    if config.low_resolution_iterations:
+        out.append(f"Images of half the size in {min(steps, config.low_resolution_iterations)} of {steps} steps.")
+    if config.proposal_every > 1:
+        out.append(f"Proposals were trained at every {config.proposal_every}th step after the warm-up.")
+    if config.lpips_every > 1 and trainer.perceptual is not None:
+        out.append(f"The LPIPS loss was taken at every {config.lpips_every}th step.")
+    if config.skip_transmittance:
+        out.append(f"The field was not asked where less than {config.skip_transmittance:g} of a ray's light is left.")
+    if steps < config.iterations:
+        out.append(
+            f"Skipped {config.iterations - steps} of {config.iterations} steps: from step {trainer.plateau_at} on "
+            "held-out pixels no longer improved, and a cool-down ended the training."
+        )
+    return out
 
 
 def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[str]]:
