@@ -51,12 +51,15 @@ METRICS = pa.schema(
         _field("ssim", pa.float64(), "structural similarity as the protocol defines it", "1"),
         _field("lpips", pa.float64(), "perceptual distance by the named backbone", "1"),
         _field("lpips_backbone", pa.string(), "network and weights of lpips"),
-        _field("clip_score", pa.float64(), "cosine of CLIP embeddings, render against source", "1"),
+        _field("clip_score", pa.float64(), "cosine of CLIP embeddings, render against photo", "1"),
+        _field("clip_network", pa.string(), "image tower and weights of clip_score"),
         _field("depth_abs_rel", pa.float64(), "mean |z - z_true| / z_true where the truth is known", "1"),
+        _field("surface_chamfer", pa.float64(), "mean of both ways' distances between rendered and true surface points "
+               "of the view, as far as 2 scene units from the origin", "scene units"),
         _field("masked", pa.bool_(), "whether a mask was applied"),
     ],
-    metadata={"format": "cat3d-metrics", "schema_version": "1", "row": "one rendered view under one protocol"},
-)
+    metadata={"format": "cat3d-metrics", "schema_version": "2", "row": "one rendered view under one protocol"},
+)  # fmt: skip
 
 TIMINGS = pa.schema(
     [

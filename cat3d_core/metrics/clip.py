@@ -14,6 +14,7 @@ import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -226,6 +227,14 @@ def find_clip() -> ClipImageTower | None:
             raise ValueError(f"{VARIABLE}: {path} holds {len(files)} .safetensors files; name the one to take.")
         path = files[0]
     try:
-        return load_clip(path)
+        file = path.stat()
+        return _loaded(path, file.st_mtime_ns, file.st_size)
+    except FileNotFoundError:
+        raise ValueError(f"{VARIABLE}: {path}: there is no such file of weights.") from None
     except ValueError as error:
         raise ValueError(f"{VARIABLE}: {error}") from error
+
+
+@lru_cache(maxsize=1)  # its name alone is asked for often, and these files are large
+def _loaded(path: Path, changed_ns: int, size: int) -> ClipImageTower:
+    return load_clip(path)

@@ -143,6 +143,32 @@ def test_each_change_makes_exactly_its_stages_stale(processed: tuple[Path, Path]
     assert "code version" in found[0].runs[run][1][0].why
 
 
+def test_clip_weights_and_protocols_make_only_the_evaluation_stale(processed: tuple[Path, Path], monkeypatch) -> None:
+    from safetensors.torch import save_file
+
+    from cat3d_core.metrics.clip import ClipConfig, ClipImageTower
+
+    tower = ClipImageTower(ClipConfig(width=64, layers=1, hidden=64, patch=8, size=16, dimensions=8, heads=1))
+    names = {"blocks.0.": "transformer.resblocks.0.", "qkv.": "attn.in_proj_", ".out.": ".attn.out_proj.",
+             ".fc.": ".mlp.c_fc.", "0.proj.": "0.mlp.c_proj."}  # fmt: skip
+    state = {}
+    for key, value in tower.state_dict().items():
+        for ours, theirs in names.items():
+            key = key.replace(ours, theirs)
+        state[f"visual.{key}"] = value
+    _, out = processed
+    save_file(state, out.parent / "clip.safetensors")
+    run = "v3-zipnerf"
+    assert read_rows(out / "metrics", METRICS).to_pylist()[0]["clip_score"] is None
+    assert any("No CLIP weights" in d for d in SceneStore.open(out / "room.zarr").record("evaluate", run).decisions)
+    monkeypatch.setenv("CAT3D_CLIP_WEIGHTS", str(out.parent / "clip.safetensors"))
+    assert stale_of(out) == {run: ["evaluate"]}
+    redo(find_stale(out)[0])
+    for row in read_rows(out / "metrics", METRICS).to_pylist():
+        assert -1 <= row["clip_score"] <= 1
+        assert row["clip_network"].startswith("clip-vit-64x1/8-16-quickgelu ")
+
+
 def test_old_results_stay_until_the_new_are_complete(processed: tuple[Path, Path], monkeypatch) -> None:
     dataset, out = processed
     images.write_png(dataset / "images" / "0002.png", np.full((20, 24, 3), 90, np.uint8))
