@@ -20,7 +20,7 @@ from cat3d_core.diffusion.checkpoint import describe
 from cat3d_core.metrics.perceptual import find_perceptual
 from cat3d_core.nerf import PRESETS
 from cat3d_core.weights import default_model_path
-from flows.bench import metrics, model, plan, poses, reconstruct, sampler, store, synthetic
+from flows.bench import metrics, model, plan, poses, reconstruct, sampler, skips, store, synthetic
 from flows.images import read_image
 from flows.readers import read_capture
 from flows.readers.base import InputError
@@ -176,6 +176,18 @@ def model_rows(quick: bool, data: Path | None) -> list[Row]:
     return [row | {name: chosen[name] for name in SAMPLER_DEFAULT} for row in rows]
 
 
+def skip_rows(quick: bool, data: Path | None) -> list[Row]:
+    """Whole runs; with `data` also the real scenes there. What is in `outputs/skips` already isn't measured again."""
+    if quick:
+        scenes = list(skips.sources(None))[1:2]
+        rows = skips.rows(scenes, ("none", "default", "all"), skips.QUICK_BASE, skips.FOLDER / "quick")
+    else:
+        scenes = list(skips.sources(data))
+        alone = [("each alone", *scene[1:]) for scene in scenes if scene[1].split("/")[0] in skips.ALONE]
+        rows = skips.rows(scenes, ("none", "default", "all")) + skips.rows(alone, tuple(skips.VARIANTS))
+    return _marked(rows, {"variant": "default"})
+
+
 def synthetic_rows(quick: bool, data: Path | None) -> list[Row]:
     return synthetic.rows(64, 8, 1) if quick else synthetic.rows()
 
@@ -226,5 +238,11 @@ BENCHES: dict[str, Bench] = {
         ),
     ),
     "model": Bench("samples of the shipped model on held-out scenes, beside baselines and ceiling", model_rows),
+    "skips": Bench(
+        "time and quality of whole runs with nothing skipped, each skip alone, the defaults, and everything skipped",
+        skip_rows,
+        (Panel("Skips", "cpu_seconds", "psnr_db", ("variant",), each=("set",), where=(("scene", "mean"),),
+               higher_is_better=True),),
+    ),
     "synthetic": Bench("procedural scenes rendered: views a second per family", synthetic_rows),
 }  # fmt: skip

@@ -96,7 +96,7 @@ class Rounds(OneRound):
         shown = [v for v in self.train if v != self.held_out]
         cameras, images = read_cameras(self.store.captured, shown), read_images(self.store.captured, shown)
         run = self.store.run(self.job.run)
-        model = shared_model(self.job) if groups else None
+        model = shared_model(self.job)
         windows = run.plan.read("window")
         for view in (v for g in groups for v in self.plan.groups[g].targets):
             x0, y0, width, height = windows[view].tolist()

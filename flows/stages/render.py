@@ -14,7 +14,7 @@ from flows.pictures import depth_picture
 from flows.progress import Meter, meter
 from flows.stages.common import read_cameras, views_with_role, write_cameras
 from flows.stages.reconstruct import read_field
-from schemas.content_key import content_key
+from schemas.content_key import array_digest, content_key
 from schemas.scene_store import Run, SceneStore, Section
 
 VERSION = 1
@@ -33,16 +33,27 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
         path = camera_path(job, store, run)
         jobs.append(("path", path, list(range(len(path)))))
     total = sum(len(cameras) for _, cameras, _ in jobs)
-    rays = 0
+    rendered, rays = 0, 0
     with meter(f"render {job.scene_id} {job.run}", total) as progress:
         for kind, cameras, views in jobs:
-            rays += render_views(run.renders(kind), field, cameras, views, content_key(step=key, kind=kind), progress)
+            made = render_views(run.renders(kind), field, cameras, views, _field_key(job, store), progress)
+            rendered, rays = rendered + len(made), rays + sum(made)
+    if rendered < total:
+        decisions.append(f"Skipped {total - rendered} of {total} renders: they are of this field and these cameras.")
     write_pictures(job, run, test)
-    return Outcome({"views": total, "rays": rays}, decisions)
+    return Outcome({"views": rendered, "rays": rays}, decisions)
 
 
-def render_views(section: Section, field: Field, cameras: Cameras, views: list[int], key: str, progress: Meter) -> int:
-    """Render the cameras that are not done yet under `key`; the number of rays cast."""
+def _field_key(job: Job, store: SceneStore) -> str:
+    """What all renders depend on beside their cameras, so that other settings leave them as they are."""
+    record = store.record("reconstruct", job.run)
+    return content_key(field=record.key if record else None, version=VERSION)
+
+
+def render_views(
+    section: Section, field: Field, cameras: Cameras, views: list[int], key: str, progress: Meter
+) -> list[int]:
+    """Render the cameras that are not done yet under `key`; the number of rays cast for each that was rendered."""
     width, height = (int(s) for s in cameras.size.max(0).values)
     section.create_array("image", (len(cameras), height, width, 3))
     section.create_array("depth", (len(cameras), height, width))
@@ -50,9 +61,10 @@ def render_views(section: Section, field: Field, cameras: Cameras, views: list[i
     section.create_array("done", (len(cameras), 32))
     write_cameras(section, cameras)
     section.write("view", np.array(views, np.int32))
-    keys = [content_key(step=key, view=view) for view in views]
+    parts = zip(views, cameras.intrinsics, cameras.world_from_camera, cameras.size, strict=True)
+    keys = [content_key(step=key, view=view, camera=[array_digest(part.numpy()) for part in c]) for view, *c in parts]
     done = section.done("done", keys, data=["image", "depth"])
-    rays = 0
+    rays = []
     for i in range(len(cameras)):
         if done[i]:
             progress.advance()
@@ -64,7 +76,7 @@ def render_views(section: Section, field: Field, cameras: Cameras, views: list[i
             padded[0, : values.shape[0], : values.shape[1]] = values.cpu().numpy()
             section.write_views(name, padded, [i])
         section.mark_done("done", [keys[i]], [i])
-        rays += out.depth.numel()
+        rays.append(out.depth.numel())
         progress.advance()
     return rays
 

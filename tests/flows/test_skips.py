@@ -210,3 +210,14 @@ def test_groups_near_captured_views_take_half_of_the_steps(model: Path, tmp_path
     record = run_stages(one, "sample")["sample"]
     assert record.work["steps"] == sum(steps)
     assert any("took 2 steps" in d for d in record.decisions)
+
+
+def test_another_path_does_not_render_the_held_out_views_again(model: Path, tmp_path: Path) -> None:
+    stages = ("ingest", "poses", "reconstruct", "render")
+    rendered = []
+    for frames in (2, 3):
+        one = job(tmp_path, model, "method=zipnerf", f"render.path_views={frames}")
+        rendered.append(run_stages(one, *stages)["render"])
+    test = len(run_of(one).renders("test").read("view"))
+    assert [record.work["views"] for record in rendered] == [test + 2, 3]
+    assert any(f"Skipped {test} of {test + 3} renders" in d for d in rendered[1].decisions)

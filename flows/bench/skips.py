@@ -1,0 +1,188 @@
+"""Benchmark of the skips: time and quality of whole runs with none, each alone, the defaults, and all.
+
+Every variant is a run of its own in one store per scene in `outputs/skips`, so that a measurement that was cut off
+goes on where it stopped, and the report of that folder shows every run. Stages whose content key another variant has
+are linked, with the time they took there: equal keys are equal results.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from flows.jobs import Job, Step, expected_steps, make_jobs, pending
+from flows.readers import read_capture
+from flows.report import summary_rows, write_report
+from flows.run_command import make_config
+from flows.scene import ensure_store, execute_stage, prepare_run, writing
+from schemas.config import SkipConfig
+from schemas.layout import LAYOUT, SCENE_STAGES
+from schemas.scene_store import SceneStore
+
+FOLDER = Path("outputs/skips")
+FAMILIES = ("llff", "dtu", "co3d", "re10k", "mip360")
+REAL = ("llff_fern", "dtu_scan24", "co3d_apple", "re10k_bedroom", "mipnerf360_bonsai", "fox", "strecha_fountain_P11")
+#: Longer side of real views in pixels, as in the sweep of real scenes.
+SIDE = 100
+#: The size of the sweeps for two cores; 80 generated views are one path of the paper.
+BASE = ("method=cat3d", "plan.views=80", "render.path_views=24",
+        "reconstruct.overrides={iterations: 500, warmup_iterations: 50}")  # fmt: skip
+QUICK_BASE = ("method=cat3d", "plan.views=10", "render.path_views=2", "reconstruct.preset=tiny")
+#: Scenes that every switch is measured alone on: one whose path captured views cover, one with a gap.
+ALONE = ("procedural:re10k", "procedural:dtu")
+SWITCHES = tuple(SkipConfig.model_fields)
+VARIANTS: dict[str, dict[str, bool]] = {
+    "none": dict.fromkeys(SWITCHES, False),
+    "all": dict.fromkeys(SWITCHES, True),
+    "default": SkipConfig().model_dump(),
+    **{f"only {name}": dict.fromkeys(SWITCHES, False) | {name: True} for name in SWITCHES},
+}
+
+
+def sources(data: Path | None, real: Sequence[str] = REAL) -> Iterator[tuple[str, str, tuple[str, ...]]]:
+    """(set, source, settings) of each scene: the procedural families, and the real scenes that are in `data`."""
+    for family in FAMILIES:
+        yield "procedural", f"procedural:{family}/1?views=24&width=64&height=64", ()
+    for name in real if data is not None else ():
+        path = data / name  # type: ignore[operator]
+        if path.is_dir():
+            yield "real", str(path), (f"ingest.downscale={max(1.0, longer_side(path) / SIDE)}",)
+
+
+def longer_side(scene: Path) -> int:
+    """Of the first view, in pixels."""
+    from flows.images import image_size
+
+    return max(image_size(read_capture(scene).paths[0]))
+
+
+def rows(
+    scenes: Sequence[tuple[str, str, tuple[str, ...]]], variants: Sequence[str], base: Sequence[str] = BASE,
+    folder: Path = FOLDER,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """One row per scene and variant, and one per set of scenes and variant with the means (scene "mean")."""
+    measured = [
+        {"set": group, "variant": variant} | run_row(make_job(source, variant, (*base, *own), folder))
+        for variant in variants
+        for group, source, own in scenes
+    ]
+    write_report(folder.resolve())
+    return [row | against_none(row, measured) for row in [*measured, *means(measured)]]
+
+
+def make_job(source: str, variant: str, settings: Sequence[str], folder: Path) -> Job:
+    """A run with three training views, named after its variant."""
+    switches = ", ".join(f"{name}: {str(on).lower()}" for name, on in VARIANTS[variant].items())
+    texts = [*settings, f"skip={{{switches}}}", f"label={variant.replace(' ', '-')}"]
+    return make_jobs(source, folder.resolve(), ["3"], make_config({}, None, texts))[1][0]
+
+
+def run_row(job: Job) -> dict[str, Any]:
+    """Do what is missing of a run, and measure it.
+
+    seconds: of all its stages; cpu_seconds: of this process and its workers, which other jobs on the machine don't
+    lengthen. evaluations: of the diffusion network. generated: views that were sampled.
+    """
+    capture = job.capture()
+    with writing(job.store_path, job.scene_id):
+        ensure_store(job, capture)
+        prepare_run(job, capture)
+        store = SceneStore.open(job.store_path, "r+")
+        for step in pending(job, expected_steps(job, capture)):
+            if linked(store, job, step):
+                continue
+            started = cpu_seconds()
+            execute_stage(job, step)
+            note(store, job, step.stage, cpu_seconds() - started)
+    records = {stage: store.record(stage, job.run) for stage in job.stages}
+    spent = store.attrs["cpu_seconds"]
+    found = [r for r in summary_rows(job.out, job.scene_id) if r["run"] == job.run][0]
+    done = {stage: record for stage, record in records.items() if record is not None}
+    return {
+        "scene": job.scene_id,
+        "seconds": sum(record.seconds for record in done.values()),
+        "cpu_seconds": sum(spent[owner(job, stage)] for stage in done),
+        "sample_seconds": sum(spent[owner(job, stage)] for stage in ("sample", "decode")),
+        "reconstruct_seconds": spent[owner(job, "reconstruct")],
+        "evaluations": int(done["sample"].work["evaluations"]),
+        "generated": int(done["decode"].work["views"]),
+        "steps": int(done["reconstruct"].work["steps"]),
+        **{name: found[name] for name in ("psnr_db", "ssim", "lpips")},
+    }
+
+
+def owner(job: Job, stage: str) -> str:
+    """Name under which a stage's CPU time is kept."""
+    return stage if stage in SCENE_STAGES else f"{job.run}/{stage}"
+
+
+def note(store: SceneStore, job: Job, stage: str, seconds: float) -> None:
+    store.set_attrs(cpu_seconds=store.attrs.get("cpu_seconds", {}) | {owner(job, stage): seconds})
+
+
+def cpu_seconds() -> float:
+    """Of this process and its children that have ended."""
+    usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(u.ru_utime + u.ru_stime for u in usage)
+
+
+def linked(store: SceneStore, job: Job, step: Step) -> bool:
+    """Take the stage's result from another run that has one with the same key, if there is one."""
+    if step.stage in SCENE_STAGES or step.stage == "evaluate":  # rows of metrics carry the run's name
+        return False
+    for name in store.runs():
+        record = store.record(step.stage, name)
+        if name == job.run or record is None or record.key != step.key:
+            continue
+        for spec in LAYOUT:
+            if spec.stage == step.stage:
+                link_arrays(store.folder / "runs" / name, store.folder / "runs" / job.run, spec.path.split("/", 2)[2])
+        store.complete(step.stage, record, job.run)
+        note(store, job, step.stage, store.attrs["cpu_seconds"][f"{name}/{step.stage}"])
+        return True
+    return False
+
+
+def link_arrays(source: Path, target: Path, pattern: str) -> None:
+    """Hard links of the arrays that match, and of the attributes of the groups above them."""
+    for array in sorted(source.glob(f"{pattern}/zarr.json")):
+        inner = array.parent.relative_to(source)
+        shutil.rmtree(target / inner, ignore_errors=True)
+        shutil.copytree(array.parent, target / inner, copy_function=os.link)
+        for group in list(inner.parents)[:-1]:
+            shutil.copy(source / group / "zarr.json", target / group / "zarr.json")
+
+
+def means(measured: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of means over the scenes of a set, for the variants that all scenes of the set were measured with."""
+    out = []
+    for group in dict.fromkeys(row["set"] for row in measured):
+        members = [row for row in measured if row["set"] == group]
+        scenes = {row["scene"] for row in members}
+        for variant in dict.fromkeys(row["variant"] for row in members):
+            chosen = [row for row in members if row["variant"] == variant]
+            if {row["scene"] for row in chosen} == scenes:
+                numbers = [n for n, v in chosen[0].items() if isinstance(v, (int, float)) and not isinstance(v, bool)]
+                mean = {n: fmean(float(row[n]) for row in chosen) for n in numbers}
+                out.append({"set": group, "variant": variant, "scene": "mean"} | mean)
+    return out
+
+
+def against_none(row: dict[str, Any], measured: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """How much faster than without skips, and what it cost: ratios of time, differences of PSNR and LPIPS."""
+    same = [r for r in (*measured, *means(measured)) if (r["set"], r["scene"]) == (row["set"], row["scene"])]
+    base = next((r for r in same if r["variant"] == "none"), None)
+    if base is None:
+        return {}
+    lpips = row.get("lpips"), base.get("lpips")
+    return {
+        "speed_up": base["cpu_seconds"] / row["cpu_seconds"],
+        "speed_up_wall": base["seconds"] / row["seconds"],
+        "psnr_change_db": row["psnr_db"] - base["psnr_db"],
+        "lpips_change": None if None in lpips else lpips[0] - lpips[1],
+    }
