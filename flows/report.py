@@ -7,23 +7,41 @@ from __future__ import annotations
 
 import base64
 import io
+import json
+import re
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, select_autoescape
-from rich.table import Table
 
+from flows.charts import Point, Series, chart
 from flows.pictures import depth_picture, error_picture
-from flows.progress import console
-from flows.published import PUBLISHED
-from schemas.layout import SCENE_STAGES, STAGES
+from flows.summary import (
+    markdown,
+    method_order,
+    method_times,
+    number,
+    paper_tables,
+    print_metrics,
+    shared_savings,
+    split_order,
+    summary_rows,
+    timing_rows,
+)
+from schemas.layout import STAGES
 from schemas.scene_store import Run, SceneStore
-from schemas.tables import METRICS, TIMINGS, read_rows
+from schemas.tables import TIMINGS, read_rows
 
-VIEWS_SHOWN = 4
-METRIC_NAMES = ("psnr_db", "ssim", "lpips")
+__all__ = ["number", "print_metrics", "summary_rows", "timing_rows", "write_report"]
+
+#: Held-out views shown of each run: all of a few, else this many.
+VIEWS_SHOWN = 3
+#: Runs of a scene that are unfolded when the page opens.
+RUNS_OPEN = 2
+SWEEP, PROBLEMS = "sweep.json", "problems.json"
 
 
 def write_report(out: Path, only_if_changed: bool = False) -> Path:
@@ -32,95 +50,68 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
     if only_if_changed and page.exists():
         return page
     scenes = [scene_section(out, path) for path in sorted(out.glob("*.zarr"))]
-    rows = summary_rows(out)
+    rows, timings = summary_rows(out), timing_rows(out)
+    tables = paper_tables(rows)
+    sweep = _document(out / SWEEP) or {}
     environment = Environment(loader=PackageLoader("flows"), autoescape=select_autoescape(["html", "j2"]))
+    environment.filters["fixed"] = number
+    published = any(e["published"] for t in tables for d in t["datasets"] for e in d["rows"])
     context = {
-        "title": out.name,
+        "title": sweep.get("name", out.name),
+        "note": sweep.get("note", ""),
+        "problems": _document(out / PROBLEMS) or [],
         "rows": rows,
-        "published": [p for p in PUBLISHED if p["dataset"] in {r["dataset"] for r in rows}],
-        "timings": timing_rows(out),
+        "psnr": {(r["scene_id"], r["run"]): r["psnr_db"] for r in rows},
+        "tables": tables,
+        "published": published,
+        "more": {name: any(r[name] is not None for r in rows) for name in ("clip_score", "depth_abs_rel")},
+        "timings": timings,
+        "longest": max((t["total"] for t in timings), default=0.0),
+        "methods": method_times(timings),
+        "stages": [s for s in STAGES if any(s in t["stages"] for t in timings)],
+        "shared": shared_savings(timings),
+        "skipped": skipped_work(scenes),
         "curve": quality_against_time(rows),
         "scenes": scenes,
+        "versions": versions(out, scenes),
+        "sweep": sweep,
     }
     page.write_text(environment.get_template("report.html.j2").render(context), encoding="utf-8")
-    (out / "report.md").write_text(markdown_table(rows), encoding="utf-8")
+    (out / "report.md").write_text(markdown(rows, tables), encoding="utf-8")
     return page
 
 
-def summary_rows(out: Path, scene_id: str | None = None) -> list[dict[str, Any]]:
-    """One row per (scene, run, protocol): means over held-out views, the seconds of the run's stages, what LPIPS is."""
-    metrics = read_rows(out / "metrics", METRICS).to_pylist()
-    seconds = {(t["scene_id"], t["run"]): t["total"] for t in timing_rows(out)}
-    groups: dict[tuple[str, str, str], list[dict[str, Any]]] = defaultdict(list)
-    for row in metrics:
-        if scene_id is None or row["scene_id"] == scene_id:
-            groups[row["scene_id"], row["run"], row["protocol"]].append(row)
-    out_rows = []
-    for (scene, run, protocol), members in sorted(groups.items()):
-        first = members[0]
-        means: dict[str, float | None] = {}
-        for name in METRIC_NAMES:
-            values = [m[name] for m in members if m[name] is not None]
-            means[name] = float(np.mean(values)) if values else None
-        out_rows.append(
-            {
-                "scene_id": scene, "run": run, "protocol": protocol, "dataset": first["dataset"],
-                "method": first["method"], "split": first["split"], "seed": first["seed"], "views": len(members),
-                "resolution": f"{first['width']}x{first['height']}", "backbone": first["lpips_backbone"] or "",
-                "masked": bool(first["masked"]), "seconds": seconds.get((scene, run)), **means,
-            }
-        )  # fmt: skip
-    return out_rows
-
-
-def timing_rows(out: Path) -> list[dict[str, Any]]:
-    """One row per (scene, run): seconds of the latest execution of each stage; shared stages count for every run."""
-    latest: dict[tuple[str, str, str], dict[str, Any]] = {}
-    for row in read_rows(out / "timings", TIMINGS).to_pylist():
-        owner = "" if row["stage"] in SCENE_STAGES else row["run"]
-        key = (row["scene_id"], owner, row["stage"])
-        if key not in latest or row["started_at"] > latest[key]["started_at"]:
-            latest[key] = row
-    runs = sorted({(scene, run) for scene, run, _ in latest if run})
-    out_rows = []
-    for scene, run in runs:
-        stages = {}
-        for stage in STAGES:
-            row = latest.get((scene, "" if stage in SCENE_STAGES else run, stage))
-            if row:
-                stages[stage] = row["seconds"]
-        out_rows.append({"scene_id": scene, "run": run, "stages": stages, "total": sum(stages.values())})
-    return out_rows
+def _document(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
 
 def scene_section(out: Path, path: Path) -> dict[str, Any]:
     """What the page shows of one scene: pictures of some held-out views per run, decisions, versions."""
     store = SceneStore.open(path)
+    truths: dict[int, np.ndarray] = {}
     runs = []
-    for name in store.runs():
+    for name in sorted(store.runs(), key=lambda n: (split_order(n.removeprefix("v").split("-")[0]), n)):
         run = store.run(name)
-        decisions = {}
-        for stage in STAGES:
-            record = store.record(stage, name)
-            if record and record.decisions:
-                decisions[stage] = record.decisions
-        drawing = out / store.scene_id / name / "plan.png"
+        records = {stage: record for stage in STAGES if (record := store.record(stage, name))}
+        folder = out / store.scene_id / name
         runs.append(
             {
                 "name": name,
-                "views": view_pictures(store, run) if store.record("render", name) else [],
-                "decisions": decisions,
+                "views": view_pictures(store, run, truths) if "render" in records else [],
+                "decisions": {stage: record.decisions for stage, record in records.items() if record.decisions},
+                "codes": {stage: record.code_version for stage, record in records.items()},
+                "model": records["sample"].inputs.get("model", "") if "sample" in records else "",
                 "config": run.attrs.get("job", {}).get("config", {}),
-                "plan": _embedded_file(drawing) if drawing.exists() else None,
-                "video": f"{store.scene_id}/{name}/path.mp4",
+                "plan": _uri((folder / "plan.png").read_bytes()) if (folder / "plan.png").exists() else None,
+                "video": f"{store.scene_id}/{name}/path.mp4" if (folder / "path.mp4").exists() else None,
                 "curve": training_curve(run),
             }
         )
     return {"id": store.scene_id, "dataset": store.dataset, "runs": runs, "provenance": store.attrs["provenance"]}
 
 
-def view_pictures(store: SceneStore, run: Run) -> list[dict[str, Any]]:
-    """Truth, render, error and depth of up to VIEWS_SHOWN held-out views, as data URIs."""
+def view_pictures(store: SceneStore, run: Run, truths: dict[int, np.ndarray]) -> list[dict[str, Any]]:
+    """Truth, render, error and depth of up to VIEWS_SHOWN held-out views, as data URIs. truths: photos read so far."""
     if "test" not in run.section("renders"):
         return []
     section = run.renders("test")
@@ -129,11 +120,12 @@ def view_pictures(store: SceneStore, run: Run) -> list[dict[str, Any]]:
     chosen = np.unique(np.linspace(0, len(views) - 1, min(VIEWS_SHOWN, len(views))).round().astype(int))
     out = []
     for i in chosen.tolist():
-        truth = store.captured.read_image("image", int(views[i]))
+        view = int(views[i])
+        truth = truths.setdefault(view, store.captured.read_image("image", view))
         image = section.read_image("image", i)
         out.append(
             {
-                "name": str(names[views[i]]),
+                "name": str(names[view]),
                 "truth": png_uri(truth),
                 "render": png_uri(image),
                 "error": png_uri(error_picture(image, truth)),
@@ -147,80 +139,65 @@ def training_curve(run: Run) -> str | None:
     """Batch PSNR against seconds of training, as an SVG."""
     if "field" not in run or "record" not in run.field:
         return None
-    record = run.field.read("record")
-    return _plot([(record[:, 1], record[:, 3], "")], "seconds", "batch PSNR (dB)")
+    points = [Point(float(seconds), float(psnr)) for _, seconds, _, psnr in run.field.read("record")]
+    return chart([Series("", points)], "seconds of training", "PSNR of the batch (dB)", lines=True)
 
 
-def quality_against_time(rows: list[dict[str, Any]]) -> str | None:
-    """Mean PSNR of every run against its seconds, one colour per method, as an SVG."""
-    by_method: dict[str, list[tuple[float, float]]] = defaultdict(list)
-    for row in rows:
-        if row["seconds"] and row["psnr_db"] is not None and np.isfinite(row["psnr_db"]):
-            by_method[f"{row['method']} ({row['protocol']})"].append((row["seconds"], row["psnr_db"]))
-    if not by_method:
-        return None
-    series = [(np.array([x for x, _ in p]), np.array([y for _, y in p]), name) for name, p in by_method.items()]
-    return _plot(series, "seconds per run", "PSNR of held-out views (dB)", marker="o", line="")
+def quality_against_time(rows: Sequence[dict[str, Any]]) -> str | None:
+    """Mean PSNR of every run against its seconds, one colour per method and protocol, as an SVG."""
+    series: dict[str, list[Point]] = defaultdict(list)
+    several = len({r["protocol"] for r in rows}) > 1
+    for r in sorted(rows, key=lambda r: method_order(r["method"])):
+        if r["seconds"] and r["psnr_db"] is not None:
+            name = f"{r['method']} ({r['protocol']})" if several else r["method"]
+            label = f"{r['scene_id']} {r['run']}: {r['psnr_db']:.2f} dB, {r['seconds']:.1f} s"
+            series[name].append(Point(r["seconds"], r["psnr_db"], label))
+    every = [Series(name, points) for name, points in series.items()]
+    return chart(every, "seconds of the run's stages", "PSNR of held-out views (dB)", log_x=True)
 
 
-def _plot(series, x_label: str, y_label: str, marker: str = "", line: str = "-") -> str:
-    import matplotlib
+def skipped_work(scenes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Sentences on skipped work with the number of runs they are true of; those that differ in numbers only are one."""
+    found: dict[tuple[str, str], dict[str, Any]] = {}
+    for scene in scenes:
+        for run in scene["runs"]:
+            for stage, sentences in run["decisions"].items():
+                for sentence in sentences:
+                    if re.match(r"(Skipped|Stopped early|Trained without|Went on|No )", sentence):
+                        kind = (stage, re.sub(r"[\d.,%]+", "#", sentence))
+                        entry = found.setdefault(
+                            kind, {"stage": stage, "sentence": sentence, "runs": 0, "alike": False}
+                        )
+                        entry["runs"] += 1
+                        entry["alike"] |= sentence != entry["sentence"]
+    return list(found.values())
 
-    matplotlib.use("Agg")
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(5, 2.6), layout="constrained")
-    axes = figure.subplots()
-    for x, y, label in series:
-        axes.plot(x, y, marker=marker, linestyle=line, label=label or None, linewidth=1)
-    axes.set_xlabel(x_label)
-    axes.set_ylabel(y_label)
-    axes.grid(alpha=0.3)
-    if any(label for _, _, label in series):
-        axes.legend(fontsize=7)
-    text = io.StringIO()
-    figure.savefig(text, format="svg")
-    svg = text.getvalue()
-    return svg[svg.index("<svg") :]
+def versions(out: Path, scenes: Sequence[dict[str, Any]]) -> dict[str, list[str]]:
+    """What made the results: packages, code versions of the stages, models, machines; several where scenes differ."""
+    found: dict[str, set[str]] = defaultdict(set)
+    for scene in scenes:
+        for name, version in scene["provenance"].items():
+            if name != "source":
+                found[name].add(str(version))
+        for run in scene["runs"]:
+            for stage, version in run["codes"].items():
+                found[f"stage {stage}"].add(str(version))
+            if run["model"]:
+                found["diffusion model"].add(f"sha256 {run['model'][:16]}")
+    for row in read_rows(out / "timings", TIMINGS).to_pylist():
+        found["machine"].add(f"{row['host']} ({row['device']})")
+    return {name: sorted(values) for name, values in found.items()}
 
 
 def png_uri(image: np.ndarray) -> str:
     """(H, W, 3) uint8 as a data URI."""
-    from matplotlib.image import imsave
+    from PIL import Image
 
     data = io.BytesIO()
-    imsave(data, image, format="png")
-    return "data:image/png;base64," + base64.b64encode(data.getvalue()).decode()
+    Image.fromarray(image).save(data, format="png")
+    return _uri(data.getvalue())
 
 
-def _embedded_file(path: Path) -> str:
-    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
-
-
-def markdown_table(rows: list[dict[str, Any]]) -> str:
-    """The summary as a Markdown table."""
-    columns = ["scene", "training views", "method", "seed", "protocol", "resolution", "test views"]
-    columns += ["PSNR (dB)", "SSIM", "LPIPS", "seconds"]
-    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
-    for r in rows:
-        lpips = f"{number(r['lpips'], 3)} ({r['backbone']})" if r["lpips"] is not None else "-"
-        cells = [r[n] for n in ("scene_id", "split", "method", "seed", "protocol", "resolution", "views")]
-        cells += [number(r["psnr_db"], 2), number(r["ssim"], 3), lpips, number(r["seconds"], 0)]
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def number(value: float | None, digits: int) -> str:
-    """A number for a table; a dash for what was not measured."""
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def print_metrics(out: Path, scene_id: str) -> None:
-    """Print the scene's rows of the summary."""
-    table = Table("run", "protocol", "test views", "PSNR (dB)", "SSIM", "LPIPS", "seconds", title=scene_id)
-    for r in summary_rows(out, scene_id):
-        lpips = f"{number(r['lpips'], 3)} {r['backbone']}" if r["lpips"] is not None else "-"
-        table.add_row(r["run"], r["protocol"], str(r["views"]), number(r["psnr_db"], 2), number(r["ssim"], 3), lpips,
-                      number(r["seconds"], 0))  # fmt: skip
-    if table.row_count:
-        console.print(table)
+def _uri(png: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(png).decode()

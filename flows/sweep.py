@@ -55,7 +55,7 @@ def open_jobs(jobs: list[Job]) -> list[Job]:
 
 def run_sweep(config: SweepConfig, out: Path) -> list[str]:
     """Do what is missing of a sweep. Returns a sentence per failure; results of the others stand."""
-    from flows.report import write_report
+    from flows.report import PROBLEMS, SWEEP, write_report
 
     out = out.resolve()
     scenes, problems = sweep_jobs(config, out)
@@ -63,7 +63,7 @@ def run_sweep(config: SweepConfig, out: Path) -> list[str]:
     total, left = sum(map(len, scenes)), sum(map(len, todo))
     console.print(f"{config.name}: {len(scenes)} scenes, {total} runs, of which {left} are to do.")
     out.mkdir(parents=True, exist_ok=True)
-    (out / "sweep.json").write_text(json.dumps(config.model_dump(mode="json"), indent=1))
+    (out / SWEEP).write_text(json.dumps(config.model_dump(mode="json"), indent=1))
     if todo:
         # Only here: importing Prefect would be half the time of a sweep in which nothing is to do.
         from flows.server import prefect_server
@@ -71,6 +71,7 @@ def run_sweep(config: SweepConfig, out: Path) -> list[str]:
 
         with prefect_server(out / ".prefect"):
             problems += sweep_flow(todo, config.workers)
+    (out / PROBLEMS).write_text(json.dumps(problems, indent=1))
     page = write_report(out, only_if_changed=not todo)
     console.print(f"Report: {page}")
     return problems

@@ -6,6 +6,7 @@ Done before the scenes' own flows, which then find their views there and only re
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Iterator, Sequence
 
 from flows.errors import describe
@@ -13,9 +14,11 @@ from flows.jobs import Job, expected_steps, pending
 from flows.progress import console
 from flows.sampling.fan_out import Totals, fan_out
 from flows.sampling.work import Work
-from flows.scene import ensure_store, execute_stage, prepare_run, writing
+from flows.scene import ensure_store, execute_stage, prepare_run, write_timing, writing
 from flows.stages.sample import sample_work
+from flows.summary import SAMPLED_AHEAD
 from schemas.scene_store import SceneStore
+from schemas.stages import StageRecord, now
 
 PREPARATION = ("ingest", "poses", "plan", "encode")
 
@@ -35,8 +38,23 @@ def sample_ahead(jobs: Sequence[Job]) -> Totals:
                 works += [work for job in own if (work := prepared(job)) is not None]
         if works:
             with _left_to_its_flow(f"{len(works)} runs"):
-                return fan_out(works, works[0].job.config.execution, f"sample {len(works)} runs")
+                started_at, started = now(), time.monotonic()
+                totals = fan_out(works, works[0].job.config.execution, f"sample {len(works)} runs")
+                write_shares(works, started_at, time.monotonic() - started)
+                return totals
         return Totals()
+
+
+def write_shares(works: Sequence[Work], started_at: str, seconds: float) -> None:
+    """A row of timings for each run: its share of the seconds, by its number of groups. Its own stage `sample`, which
+    finds the views there, takes next to nothing."""
+    groups = [sum(len(items) for items in work.passes) for work in works]
+    for work, count in zip(works, groups):
+        record = StageRecord(
+            stage=SAMPLED_AHEAD, key=work.key, started_at=started_at, finished_at=now(),
+            seconds=seconds * count / max(1, sum(groups)), work={"groups": count},
+        )  # fmt: skip
+        write_timing(work.job, record)
 
 
 @contextlib.contextmanager
