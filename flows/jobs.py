@@ -155,6 +155,9 @@ def expected_steps(job: Job, capture: Capture, digests: dict[str, Any] | None = 
     steps: dict[str, Step] = {}
     for stage in job.stages:
         inputs = external[stage] | {f"{s} key": steps[s].key for s in STAGES[stage] if s in steps}
+        if stage == "evaluate":  # of the renders it reads those of held-out views alone: a new path changes no number
+            field, test = steps["reconstruct"].key, {"views": roles["test"], "rendered": job.config.render.test_views}
+            inputs["render key"] = content_key(field=field, test=test, version=steps["render"].version)
         module = importlib.import_module(f"flows.stages.{stage}")
         if hasattr(module, "inputs"):
             inputs |= module.inputs(job)

@@ -15,6 +15,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import pyarrow.parquet as pq
+
 from flows.jobs import Job, Step, expected_steps, make_jobs, pending
 from flows.readers import read_capture
 from flows.report import summary_rows, write_report
@@ -25,6 +27,7 @@ from schemas.layout import LAYOUT, SCENE_STAGES
 from schemas.scene_store import SceneStore
 
 FOLDER = Path("outputs/skips")
+START, END = "<!-- tables: written by python -m flows.bench.skips -->", "<!-- end of tables -->"
 FAMILIES = ("llff", "dtu", "co3d", "re10k", "mip360")
 REAL = ("llff_fern", "dtu_scan24", "co3d_apple", "re10k_bedroom", "mipnerf360_bonsai", "fox", "strecha_fountain_P11")
 #: Longer side of real views in pixels, as in the sweep of real scenes.
@@ -179,10 +182,55 @@ def against_none(row: dict[str, Any], measured: Sequence[dict[str, Any]]) -> dic
     base = next((r for r in same if r["variant"] == "none"), None)
     if base is None:
         return {}
-    lpips = row.get("lpips"), base.get("lpips")
+    new, old = row.get("lpips"), base.get("lpips")
     return {
         "speed_up": base["cpu_seconds"] / row["cpu_seconds"],
         "speed_up_wall": base["seconds"] / row["seconds"],
         "psnr_change_db": row["psnr_db"] - base["psnr_db"],
-        "lpips_change": None if None in lpips else lpips[0] - lpips[1],
+        "lpips_change": None if new is None or old is None else new - old,
     }
+
+
+def tables(measured: Sequence[dict[str, Any]]) -> str:
+    """Markdown: per set of scenes the means of each variant, and per scene everything skipped against nothing."""
+    variant = (
+        "| variant | CPU s | faster | sample | reconstruct | evaluations | views | steps | PSNR dB | change | LPIPS |"
+    )
+    lines = []
+    for group in dict.fromkeys(row["set"] for row in measured):
+        members = [row for row in measured if row["set"] == group]
+        scenes = [row["scene"] for row in members if row["variant"] == "none" and row["scene"] != "mean"]
+        lines += [f"Means of {group} ({', '.join(scenes)}):", "", variant, "|---" * 11 + "|"]
+        lines += [
+            f"| {r['variant']} | {r['cpu_seconds']:.1f} | {r['speed_up']:.2f}x | {r['sample_seconds']:.1f} | "
+            f"{r['reconstruct_seconds']:.1f} | {r['evaluations']:.0f} | {r['generated']:.0f} | {r['steps']:.0f} | "
+            f"{r['psnr_db']:.2f} | {r['psnr_change_db']:+.2f} | {r['lpips']:.3f} |"
+            for r in members
+            if r["scene"] == "mean"
+        ]
+        lines += [""]
+    lines += ["Every scene, `none` and `default`:", ""]
+    lines += ["| scene | CPU s | | faster | PSNR dB | | change | LPIPS | |", "|---" * 9 + "|"]
+    rows = {(row["scene"], row["variant"]): row for row in measured if row["scene"] != "mean"}
+    for scene in dict.fromkeys(scene for scene, _ in rows):
+        if (scene, "none") in rows and (scene, "default") in rows:
+            a, b = rows[scene, "none"], rows[scene, "default"]
+            lines += [
+                f"| {scene} | {a['cpu_seconds']:.1f} | {b['cpu_seconds']:.1f} | {b['speed_up']:.2f}x | "
+                f"{a['psnr_db']:.2f} | {b['psnr_db']:.2f} | {b['psnr_change_db']:+.2f} | {a['lpips']:.3f} | "
+                f"{b['lpips']:.3f} |"
+            ]
+    return "\n".join(lines)
+
+
+def write_tables(page: Path, table: Path) -> None:
+    """Put the tables of a Parquet file into the page, between its markers."""
+    text = page.read_text(encoding="utf-8")
+    before, rest = text.split(START)
+    _, after = rest.split(END)
+    found = tables(pq.ParquetFile(table).read().to_pylist())
+    page.write_text(f"{before}{START}\n{found}\n{END}{after}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write_tables(Path("docs/skips.md"), Path("docs/benchmarks/skips.parquet"))
