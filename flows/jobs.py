@@ -144,7 +144,7 @@ def expected_steps(job: Job, capture: Capture, digests: dict[str, Any] | None = 
     external: dict[str, dict[str, Any]] = {
         "ingest": {"images": digests["images"], "lens": digests["lens"]},
         "poses": {"cameras": digests["cameras"]},
-        "plan": {"train": roles["train"], "test": roles["test"]},
+        "plan": {"train": roles["train"]},
         "encode": {},
         "sample": {},
         "decode": {},

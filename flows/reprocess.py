@@ -20,10 +20,10 @@ from rich.table import Table
 from flows.jobs import Job, Step, capture_digests, expected_steps, pending
 from flows.progress import console
 from flows.readers.base import Capture, InputError
+from flows.summary import timing_rows
 from schemas.errors import StoreError
-from schemas.layout import downstream
+from schemas.layout import SCENE_STAGES, downstream
 from schemas.scene_store import SceneStore
-from schemas.tables import TIMINGS, read_rows
 
 FILTERS = ("scene", "dataset", "method", "run", "seed")
 
@@ -109,7 +109,7 @@ def print_stale(found: list[Stale], out: Path) -> float:
     for stale in found:
         for name, (job, steps) in stale.runs.items():
             for step in steps:
-                once = (job.scene_id, step.stage) if step.stage in ("ingest", "poses", "encode") else None
+                once = (job.scene_id, step.stage) if step.stage in SCENE_STAGES else None
                 if once in shared:
                     continue
                 shared.add(once) if once else None
@@ -122,15 +122,13 @@ def print_stale(found: list[Stale], out: Path) -> float:
 
 
 def expected_costs(out: Path) -> dict[tuple[str, str, str], float]:
-    """Seconds by (scene, run, stage): the last execution; under ("", "", stage) the median over all scenes."""
-    last: dict[tuple[str, str, str], tuple[Any, float]] = {}
+    """Seconds by (scene, run, stage): the last execution; under ("", "", stage) the median over all runs."""
+    costs: dict[tuple[str, str, str], float] = {}
     every: dict[str, list[float]] = defaultdict(list)
-    for row in read_rows(out / "timings", TIMINGS).to_pylist():
-        key = (row["scene_id"], row["run"], row["stage"])
-        every[row["stage"]].append(row["seconds"])
-        if key not in last or row["started_at"] > last[key][0]:
-            last[key] = (row["started_at"], row["seconds"])
-    costs = {key: seconds for key, (_, seconds) in last.items()}
+    for row in timing_rows(out):
+        for stage, seconds in row["stages"].items():
+            costs[row["scene_id"], row["run"], stage] = seconds
+            every[stage].append(seconds)
     return costs | {("", "", stage): statistics.median(values) for stage, values in every.items()}
 
 
