@@ -80,6 +80,52 @@ def test_nerfbaselines(pair, masked_pair, reference):
     check(result, psnr64(x, y), reference.ssim(x, y, reference.gaussian))
 
 
+def test_google_against_dm_pix_itself(real_pairs):
+    """In float64, all three photographs. dm_pix needs JAX, which the tests don't install."""
+    dm_pix = pytest.importorskip("dm_pix")
+    jax = pytest.importorskip("jax")
+    jax.config.update("jax_enable_x64", True)
+    for prediction, target in zip(*real_pairs):
+        x, y = (i.permute(1, 2, 0).double().numpy() for i in (prediction, target))
+        expected = float(dm_pix.ssim(jax.numpy.asarray(x), jax.numpy.asarray(y)))
+        check(evaluate("google", prediction, target), psnr64(x, y), expected)
+
+
+def test_nerfbaselines_against_the_package_itself(pair, masked_pair):
+    """Its 8-bit conversion and its metrics, fed float64 (it computes in float32, to about 1e-6)."""
+    metrics = pytest.importorskip("nerfbaselines.metrics")
+    utils = pytest.importorskip("nerfbaselines.utils")
+
+    def converted(image):
+        eight = utils.image_to_srgb(image.permute(1, 2, 0).numpy(), np.uint8, color_space="srgb")
+        return utils.convert_image_dtype(eight, np.float32).astype(np.float64)[None]
+
+    for prediction, target, *mask in (pair, masked_pair):
+        x, y = converted(prediction), converted(target)
+        if mask:
+            x, y = (i * mask[0].numpy()[None, ..., None] for i in (x, y))
+        result = evaluate("nerfbaselines", prediction, target, *mask)
+        check(result, float(-10 * np.log10(((x - y) ** 2).mean())), float(metrics.dmpix_ssim(x, y)[0]))
+        assert result["ssim"] == pytest.approx(float(metrics.ssim(x, y)[0]), abs=5e-6)
+        assert result["psnr"] == pytest.approx(float(metrics.psnr(x, y)[0]), abs=5e-5)
+
+
+def test_3dgs_against_its_own_convolution(pair):
+    """loss_utils.ssim of the splatting code: grouped convolution with zeros around the image, here in float64."""
+    line = torch.tensor([math.exp(-((i - 5) ** 2) / (2 * 1.5**2)) for i in range(11)], dtype=torch.float64)
+    window = (line[:, None] * line / line.sum() ** 2).expand(3, 1, 11, 11)
+
+    def mean(images):
+        return torch.nn.functional.conv2d(images, window, padding=5, groups=3)
+
+    x, y = (quantize(i[None], "round").double() for i in pair)
+    mu_x, mu_y = mean(x), mean(y)
+    var_x, var_y, covariance = mean(x * x) - mu_x**2, mean(y * y) - mu_y**2, mean(x * y) - mu_x * mu_y
+    c1, c2 = 0.01**2, 0.03**2
+    local = (2 * mu_x * mu_y + c1) * (2 * covariance + c2) / ((mu_x**2 + mu_y**2 + c1) * (var_x + var_y + c2))
+    check(evaluate("3dgs", *pair), float(-10 * torch.log10(((x - y) ** 2).mean())), float(local.mean()))
+
+
 def test_perceptual_column_is_named_after_what_was_measured_and_fed_its_range(pair):
     distance = PerceptualDistance("lpips-squeeze")
     prediction, target = (i[None] for i in pair)
