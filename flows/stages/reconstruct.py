@@ -14,7 +14,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.metrics.perceptual import find_perceptual
+from cat3d_core.metrics.perceptual import find_perceptual, perceptual_name
 from cat3d_core.nerf import PRESETS, Field, ReconstructConfig, Trainer, Views
 from flows.jobs import Job, Outcome
 from flows.progress import meter
@@ -76,8 +76,8 @@ def trainer_config(job: Job) -> ReconstructConfig:
 def inputs(job: Job) -> dict[str, Any]:
     """The full trainer configuration and the LPIPS network: a changed preset makes old fields stale."""
     config = trainer_config(job)
-    perceptual = find_perceptual() if config.lpips_weight > 0 else None
-    return {"trainer": dataclasses.asdict(config), "perceptual": perceptual.name if perceptual else None}
+    perceptual = perceptual_name() if config.lpips_weight > 0 else None
+    return {"trainer": dataclasses.asdict(config), "perceptual": perceptual}
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
