@@ -191,8 +191,10 @@ class SkipConfig(_Model):
     """Reconstruct: training of the proposals at all but every fourth step."""
     lpips: bool = True
     """Reconstruct: the LPIPS loss at all but every fourth step."""
+    rays: bool = True
+    """Reconstruct: rays of a step beyond a 24th of all pixels, where few views are trained on."""
     low_resolution: bool = True
-    """Reconstruct: full resolution in the first quarter of the steps."""
+    """Reconstruct: full resolution, and with it the LPIPS loss, in the first eighth of the steps."""
     plateau: bool = True
     """Reconstruct: what is left of the steps when held-out pixels no longer improve, but for a cool-down."""
     workers: bool = True

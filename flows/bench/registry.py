@@ -183,8 +183,11 @@ def skip_rows(quick: bool, data: Path | None) -> list[Row]:
         rows = skips.rows(scenes, ("none", "default", "all"), skips.QUICK_BASE, skips.FOLDER / "quick")
     else:
         scenes = list(skips.sources(data))
-        alone = [("each alone", *scene[1:]) for scene in scenes if scene[1].split("/")[0] in skips.ALONE]
-        rows = skips.rows(scenes, ("none", "default", "all")) + skips.rows(alone, tuple(skips.VARIANTS))
+        rows = skips.rows(scenes, ("none", "default"))
+        for family, switches in skips.ALONE.items():
+            alone = [(f"{family}, each alone", *scene[1:]) for scene in scenes if f":{family}/" in scene[1]]
+            variants = ("none", *(f"only {name}" for name in switches), "default", "all")
+            rows += skips.rows(alone, variants, skips.SHORT_BASE, skips.FOLDER / "alone")
     return _marked(rows, {"variant": "default"})
 
 

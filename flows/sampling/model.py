@@ -95,7 +95,8 @@ def sampler_settings(job: Job) -> dict[str, Any]:
     recommended = default | _description(job)["provenance"].get("sampler", {})
     own = {name: getattr(settings, name) for name in default}
     chosen = {name: recommended[name] if value is None else value for name, value in own.items()}
-    interval = settings.guidance_log_snr or GUIDANCE_INTERVAL if skip.guidance else (None, None)
+    limited = skip.guidance and chosen["guidance"] != 1
+    interval = settings.guidance_log_snr or GUIDANCE_INTERVAL if limited else (None, None)
     return chosen | {"guidance_log_snr": list(interval), "near_steps": skip.near_steps}
 
 

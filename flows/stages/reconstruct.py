@@ -24,6 +24,8 @@ from schemas.scene_store import Run, SceneStore
 
 VERSION = 1
 CHECKPOINT_INTERVAL_S = 20.0
+#: `skip.rays`: steps that see as many rays as there are pixels, at least, and the fewest rays of a step.
+PASSES, FEWEST_RAYS = 24, 256
 #: CAT3D: LPIPS weight 1 on CO3D and mip-NeRF 360, 0.25 elsewhere.
 STRONG_LPIPS = 4.0
 STRONG_LPIPS_DATASETS = ("co3d", "mip360", "mipnerf360")
@@ -35,8 +37,8 @@ def skip_settings(iterations: int) -> dict[str, dict[str, Any]]:
         "empty_space": {"skip_transmittance": 0.01},
         "proposals": {"proposal_every": 4},
         "lpips": {"lpips_every": 4},
-        "low_resolution": {"low_resolution_iterations": iterations // 4},
-        "plateau": {"plateau_patience": 3},
+        "low_resolution": {"low_resolution_iterations": iterations // 8},
+        "plateau": {"plateau_patience": 2, "plateau_every": 25, "plateau_tolerance": 0.1},
     }
 
 
@@ -57,6 +59,7 @@ def trainer_config(job: Job) -> ReconstructConfig:
     off = ReconstructConfig()  # as in the paper: nothing is skipped
     for name, changes in skip_settings(iterations if isinstance(iterations, int) else config.iterations).items():
         on = getattr(job.config.skip, name)
+        on = on and not (name == "low_resolution" and config.lpips_weight == 0)  # patches are all it saves
         chosen = {n: value if on else getattr(off, n) for n, value in changes.items()}
         config = dataclasses.replace(config, **chosen)
     known = {f.name for f in dataclasses.fields(ReconstructConfig)}
@@ -77,7 +80,7 @@ def inputs(job: Job) -> dict[str, Any]:
     """The full trainer configuration and the LPIPS network: a changed preset makes old fields stale."""
     config = trainer_config(job)
     perceptual = perceptual_name() if config.lpips_weight > 0 else None
-    return {"trainer": dataclasses.asdict(config), "perceptual": perceptual}
+    return {"trainer": dataclasses.asdict(config), "perceptual": perceptual, "rays": job.config.skip.rays}
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
@@ -86,7 +89,12 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     config = trainer_config(job)
     views, decisions = training_views(job, store, run)
     if bool(views.captured.all()):  # as for the baseline: captured views agree with each other
-        config = dataclasses.replace(config, lpips_weight=0.0)
+        config = dataclasses.replace(config, lpips_weight=0.0, low_resolution_iterations=0)
+    if job.config.skip.rays and (most := max(FEWEST_RAYS, len(views.pixels) // PASSES)) < config.batch_rays:
+        decisions.append(
+            f"{most} instead of {config.batch_rays} rays a step: {PASSES} steps see as many as all pixels."
+        )
+        config = dataclasses.replace(config, batch_rays=most)
     smallest = int(views.size.min())
     if config.patch_size > smallest:
         config = dataclasses.replace(config, patch_size=smallest)

@@ -222,8 +222,8 @@ def test_the_sampler_is_the_runs_own_else_the_models_else_the_measured_default(t
 
     skipped = {"guidance_log_snr": [None, 2.0], "near_steps": False}
     assert chosen("plain") == SAMPLER_DEFAULT | skipped
-    assert chosen("advised") == advice | skipped
-    assert chosen("advised", "sample.steps=9") == advice | {"steps": 9} | skipped
     everything = {"guidance_log_snr": [None, None], "near_steps": False}
+    assert chosen("advised") == advice | everything, "without guidance there is no interval of it"
+    assert chosen("advised", "sample.steps=9") == advice | {"steps": 9} | everything
     assert chosen("plain", "skip=none") == PAPER_SAMPLER | everything
     assert chosen("plain", "skip=none", "sample.guidance_log_snr=[-5, 2]") == PAPER_SAMPLER | everything
