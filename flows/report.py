@@ -39,8 +39,11 @@ __all__ = ["number", "print_metrics", "summary_rows", "timing_rows", "write_repo
 
 #: Held-out views shown of each run: all of a few, else this many.
 VIEWS_SHOWN = 3
-#: Runs of a scene that are unfolded when the page opens.
-RUNS_OPEN = 2
+#: In sentences on work that was not done.
+SKIPPED = re.compile(
+    r"^(Skipped|Sampled nothing|Trained without|Trained on captured|Went on|Images of half|Proposals were trained at|"
+    r"The LPIPS loss was taken|The field was not asked|Started no workers)|left out|need not be|were saved|are used, chosen"
+)
 SWEEP, PROBLEMS = "sweep.json", "problems.json"
 
 
@@ -90,7 +93,7 @@ def scene_section(out: Path, path: Path) -> dict[str, Any]:
     store = SceneStore.open(path)
     truths: dict[int, np.ndarray] = {}
     runs = []
-    for name in sorted(store.runs(), key=lambda n: (split_order(n.removeprefix("v").split("-")[0]), n)):
+    for name in sorted(store.runs(), key=_run_order):
         run = store.run(name)
         records = {stage: record for stage in STAGES if (record := store.record(stage, name))}
         folder = out / store.scene_id / name
@@ -108,6 +111,11 @@ def scene_section(out: Path, path: Path) -> dict[str, Any]:
             }
         )
     return {"id": store.scene_id, "dataset": store.dataset, "runs": runs, "provenance": store.attrs["provenance"]}
+
+
+def _run_order(name: str) -> tuple:
+    split, _, method = name.removeprefix("v").partition("-")
+    return split_order(split), method_order(method)
 
 
 def view_pictures(store: SceneStore, run: Run, truths: dict[int, np.ndarray]) -> list[dict[str, Any]]:
@@ -163,7 +171,7 @@ def skipped_work(scenes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         for run in scene["runs"]:
             for stage, sentences in run["decisions"].items():
                 for sentence in sentences:
-                    if re.match(r"(Skipped|Stopped early|Trained without|Went on|No )", sentence):
+                    if SKIPPED.search(sentence):
                         kind = (stage, re.sub(r"[\d.,%]+", "#", sentence))
                         entry = found.setdefault(
                             kind, {"stage": stage, "sentence": sentence, "runs": 0, "alike": False}

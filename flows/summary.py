@@ -79,7 +79,7 @@ def paper_tables(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             here = [r for r in own if r["dataset"] == dataset]
             published = [p for p in PUBLISHED if p["dataset"] == dataset] if protocol == protocols[0] else []
             entries = [
-                _entry(m, True, "the paper's scenes and size", [p for p in published if p["method"] == m], splits)
+                _entry(m, True, "the paper's scenes", [p for p in published if p["method"] == m], splits)
                 for m in dict.fromkeys(p["method"] for p in published)
             ]
             for method in sorted({r["method"] for r in here}, key=method_order):

@@ -109,7 +109,7 @@ def test_papers_layout_has_its_rows_apart_from_ours(tmp_path: Path) -> None:
     assert ours["cells"][0] == {"psnr_db": 21.0, "ssim": 0.525, "lpips": 0.5}
     assert ours["what"] == "mean of 2 scenes · 64x48 · st-lpips-alex"
     lines = (write_report(tmp_path).parent / "report.md").read_text().splitlines()
-    assert "| llff | *CAT3D* | *the paper's scenes and size* | *21.58 / 0.731 / 0.181* | *-* |" in lines
+    assert "| llff | *CAT3D* | *the paper's scenes* | *21.58 / 0.731 / 0.181* | *-* |" in lines
     assert (
         "| llff | zipnerf | mean of 2 scenes · 64x48 · st-lpips-alex | 21.00 / 0.525 / 0.500 | 30.00 / 0.750 / 0.500 |"
         in lines
