@@ -42,7 +42,8 @@ VIEWS_SHOWN = 3
 #: In sentences on work that was not done.
 SKIPPED = re.compile(
     r"^(Skipped|Sampled nothing|Trained without|Trained on captured|Went on|Images of half|Proposals were trained at|"
-    r"The LPIPS loss was taken|The field was not asked|Started no workers)|left out|need not be|were saved|are used, chosen"
+    r"The LPIPS loss was taken|The field was not asked|Started no workers)|"
+    r"left out|need not be|were saved|are used, chosen"
 )
 SWEEP, PROBLEMS = "sweep.json", "problems.json"
 
