@@ -79,9 +79,7 @@ def run_training(config: TrainRunConfig, out: Path, own: Ranks) -> None:
     folder = config.bank.folder or out
     with _only_one(folder, "bank") if own.first else contextlib.nullcontext():
         autoencoder, bank = prepare(config, network, folder, own)
-    scenes = held_out(
-        config.bank.families, config.sample_scenes, network.image_size, max(8, network.views), config.bank.texture_size
-    )
+    scenes = held_out(config.bank.families, config.sample_scenes, network.image_size, max(8, network.views))
     model = starting_model(network, autoencoder, config.start, config.seed)
     families, textures = ", ".join(config.bank.families), config.bank.textures
     origin = {

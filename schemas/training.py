@@ -44,8 +44,6 @@ class SceneBankConfig(_Model):
     """1: as rendered; 2: also recoloured and mirrored; 3: also recoloured."""
     textures: Path | None = None
     """Folder of photographs (.jpg) to cut textures from, beside the procedural ones."""
-    texture_size: Annotated[int, Field(ge=1, le=1024)] = 128
-    """Side of textures in texels; 1 paints every object in one colour, which leaves little but geometry to learn."""
     folder: Path | None = None
     """Where scenes, autoencoder and latents are kept; None: with the model. Several trainings may share one."""
     max_gib: PositiveFloat = 8.0

@@ -38,22 +38,14 @@ def surface_points(depth: Tensor, cameras: Cameras) -> Tensor:
 
 
 def training_capture(
-    family: str,
-    seed: int,
-    views: int,
-    size: int,
-    textures: Tensor | None = None,
-    device: torch.device | str = "cpu",
-    texture_size: int = 128,
+    family: str, seed: int, views: int, size: int, textures: Tensor | None = None, device: torch.device | str = "cpu"
 ) -> Capture:
     """A random scene of the family, seen from a capture of random spread, image on the CPU.
-
-    texture_size: side of its textures in texels; 1 paints every object in one colour.
 
     As in use, some captures are normalised with sparse surface points and some from their cameras alone.
     Raises ValueError where the scene has no free place for the cameras (take the next seed).
     """
-    scene = random_scene(family, seed, textures, texture_size)
+    scene = random_scene(family, seed, textures)
     spread, with_points = torch.rand(2, generator=generator(seed, "capture")).tolist()
     cameras = random_cameras(scene, seed, views, size, size, spread=0.35 + 0.65 * spread)
     scene = scene.to(device)

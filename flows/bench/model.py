@@ -44,13 +44,11 @@ FEW_STEPS = SamplerConfig("ddim", "trailing", 4, GuidanceConfig(scale=1.0))
 MANY_STEPS = SamplerConfig("unipc", "log_snr", 20, GuidanceConfig(scale=1.0))
 
 
-def held_out_group(
-    family: str, number: int, size: int, views: int = 8, spread: float = 0.7, texture_size: int = 128
-) -> tuple[Traced, Cameras]:
+def held_out_group(family: str, number: int, size: int, views: int = 8, spread: float = 0.7) -> tuple[Traced, Cameras]:
     """Views (N, ...) and normalised cameras of held-out scene `number`, in random order."""
     for attempt in range(10):
         seed = derive_seed(1, "held-out scene", family, number, attempt) & 0x7FFFFFFF
-        scene = random_scene(family, seed, texture_size=texture_size)
+        scene = random_scene(family, seed)
         try:
             cameras = random_cameras(scene, seed, views, size, size, spread=spread)
         except ValueError:  # no free place for the cameras: the next seed

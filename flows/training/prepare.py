@@ -47,8 +47,7 @@ def prepare(config: TrainRunConfig, network: ModelConfig, folder: Path, own: Ran
     scenes = sum(min(renders.SHARD_SCENES, bank.scenes - n * renders.SHARD_SCENES) for n in mine)
     with meter("render scenes", scenes) as bar:
         renders.render_shards(
-            folder, bank.families, bank.scenes, bank.views, size, config.seed, photos, own.device, mine, bar.advance,
-            bank.texture_size,
+            folder, bank.families, bank.scenes, bank.views, size, config.seed, photos, own.device, mine, bar.advance
         )
     own.barrier()
     autoencoder = get_autoencoder(config, network, folder, photos, own)

@@ -62,20 +62,13 @@ def as_tensors(capture: Capture) -> dict[str, Tensor]:
 
 
 def training_scene(
-    family: str,
-    number: int,
-    seed: int,
-    views: int,
-    size: int,
-    textures: Tensor | None,
-    device: torch.device | str,
-    texture_size: int = 128,
+    family: str, number: int, seed: int, views: int, size: int, textures: Tensor | None, device: torch.device | str
 ) -> Capture:
     """Training scene `number`. Raises ValueError where ten draws of it have no free place for cameras."""
     for attempt in range(ATTEMPTS):
         try:
             key = derive_seed(seed, "training scene", number, attempt) & 0x7FFFFFFF
-            return training_capture(family, key, views, size, textures, device, texture_size)
+            return training_capture(family, key, views, size, textures, device)
         except ValueError:  # no free place for the cameras: the next draw
             if attempt == ATTEMPTS - 1:
                 raise
@@ -93,7 +86,6 @@ def render_shards(
     device: torch.device | str,
     mine: Sequence[int],
     advance: Callable[[int], None],
-    texture_size: int = 128,
 ) -> None:
     """Render the shards `mine` that are not there yet, families in turn. `advance` is told of scenes done."""
     for shard in mine:
@@ -105,8 +97,7 @@ def render_shards(
         parts = []
         for number in numbers:
             family = families[number % len(families)]
-            capture = training_scene(family, number, seed, views, size, textures, device, texture_size)
-            parts.append(as_tensors(capture))
+            parts.append(as_tensors(training_scene(family, number, seed, views, size, textures, device)))
             advance(1)
         stacked = {name: torch.stack([p[name] for p in parts]) for name in parts[0]}
         stacked["family"] = torch.tensor([number % len(families) for number in numbers])

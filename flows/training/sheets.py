@@ -29,14 +29,10 @@ class HeldOut:
     cameras: tuple[Cameras, ...]
 
 
-def held_out(families: Sequence[str], scenes: int, size: int, views: int, texture_size: int = 128) -> HeldOut:
+def held_out(families: Sequence[str], scenes: int, size: int, views: int) -> HeldOut:
     """`scenes` held-out scenes of each family."""
     names = tuple(family for family in families for _ in range(scenes))
-    groups = [
-        held_out_group(family, number, size, views, texture_size=texture_size)
-        for family in families
-        for number in range(scenes)
-    ]
+    groups = [held_out_group(family, number, size, views) for family in families for number in range(scenes)]
     images = torch.stack([traced.image for traced, _ in groups]).float()
     return HeldOut(names, images, tuple(cameras for _, cameras in groups))
 
