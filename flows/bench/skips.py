@@ -22,9 +22,9 @@ from flows.readers import read_capture
 from flows.report import summary_rows, write_report
 from flows.run_command import make_config
 from flows.scene import ensure_store, execute_stage, prepare_run, writing
-from schemas.config import SkipConfig
 from schemas.layout import LAYOUT, SCENE_STAGES
 from schemas.scene_store import SceneStore
+from schemas.skip import SkipConfig
 
 FOLDER = Path("outputs/skips")
 START, END = "<!-- tables: written by python -m flows.bench.skips -->", "<!-- end of tables -->"

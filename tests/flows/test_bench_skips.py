@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from flows.bench import skips
-from schemas.config import SkipConfig
 from schemas.scene_store import SceneStore
+from schemas.skip import SkipConfig
 from tests.flows.sampling.scene import random_model
 from tests.flows.test_skips import SMALL, SOURCE
 

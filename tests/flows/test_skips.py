@@ -22,9 +22,10 @@ from flows.stages import sample as sample_stage
 from flows.stages.common import read_cameras, read_images
 from flows.stages.reconstruct import generated_views, read_field, trainer_config
 from flows.stages.sample import group_sampler, network_inputs
-from schemas.config import SkipConfig, parse_config
+from schemas.config import parse_config
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
+from schemas.skip import SkipConfig
 from tests.flows.sampling.scene import VIEWS, random_model, run_of, run_stages
 
 SOURCE = "procedural:dtu/3?views=9&width=32&height=24"

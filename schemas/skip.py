@@ -1,0 +1,53 @@
+"""What a scene may do without: the one place with all switches (rules and measurements: docs/skips.md)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import model_validator
+
+from schemas.strict import StrictModel
+
+
+class SkipConfig(StrictModel):
+    """Work that a scene may not need, a switch for each; `skip: none` and `skip: all` set all of them.
+
+    A switch that is off changes no result. What was skipped, why and what it saved is among the decisions of the
+    stage. The defaults are on the measured front (docs/skips.md).
+    """
+
+    coverage: bool = True
+    """Plan: views that add nothing to the coverage of the scene."""
+    covered_path: bool = True
+    """Plan: all generated views, where captured views see what the path sees from nearly the same directions."""
+    rounds: bool = False
+    """Sample: groups are sampled in rounds, each where a briefly trained field knows least, as long as a round lowers
+    its error in a held-out captured view."""
+    near_steps: bool = False
+    """Sample: half of the steps for groups near captured views."""
+    guidance: bool = True
+    """Sample: the unconditional half of the network outside the interval `sample.guidance_log_snr`."""
+    solver: bool = True
+    """Sample: steps beyond those a better solver needs for the error of the paper's 50 steps of DDIM. Models whose
+    file recommends a sampler are sampled with that one either way."""
+    empty_space: bool = True
+    """Reconstruct, render: queries of the field behind what stops all but a hundredth of a ray's light."""
+    proposals: bool = True
+    """Reconstruct: training of the proposals at all but every fourth step."""
+    lpips: bool = True
+    """Reconstruct: the LPIPS loss at all but every fourth step."""
+    rays: bool = True
+    """Reconstruct: rays of a step beyond a 24th of all pixels, where few views are trained on."""
+    low_resolution: bool = True
+    """Reconstruct: full resolution, and with it the LPIPS loss, in the first eighth of the steps."""
+    plateau: bool = True
+    """Reconstruct: what is left of the steps when held-out pixels no longer improve, but for a cool-down."""
+    workers: bool = True
+    """Sample, decode: worker processes for what this one has done before they would have started."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _all_or_none(cls, value: Any) -> Any:
+        if value in ("all", "none"):
+            return dict.fromkeys(cls.model_fields, value == "all")
+        return value
