@@ -39,8 +39,9 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     run = store.run(job.run)
     plan = StoredPlan(store, run, job.config.seed)
     rounds = Rounds(job, store, plan) if job.config.skip.rounds else OneRound(plan)
-    totals, groups = Totals(), []
+    totals, groups, spared = Totals(), [], set(range(len(plan.groups)))
     for passes in rounds:
+        spared -= {g for items in passes for g in items}
         work = sample_work(job, store, key, passes)
         groups += [g for items in work.passes for g in items]
         label = f"sample {job.scene_id} {job.run}"
@@ -48,7 +49,12 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     made = {view for g in rounds.kept for view in plan.groups[g].targets}
     left_out = sorted(set(range(len(plan))) - made)
     run.generated.mark_skipped("done_latent", left_out)
-    decisions = [f"{len(left_out)} of {len(plan)} planned views were left out."] if left_out else []
+    decisions = []
+    if left_out:
+        saved = sum(group_evaluations(job, plan.groups[g], group_sampler(job, plan, plan.groups[g])) for g in spared)
+        decisions.append(
+            f"{len(left_out)} of {len(plan)} planned views were left out; {saved} evaluations of the network were saved."
+        )
     decisions += rounds.decisions + sampler_decisions(job, plan, rounds.kept) + totals.decisions
     configs = [group_sampler(job, plan, plan.groups[g]) for g in groups]
     counts = {"views": sum(len(plan.groups[g].targets) for g in groups), "groups": len(groups)}
