@@ -53,7 +53,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     if left_out:
         saved = sum(group_evaluations(job, plan.groups[g], group_sampler(job, plan, plan.groups[g])) for g in spared)
         decisions.append(
-            f"{len(left_out)} of {len(plan)} planned views were left out; {saved} evaluations of the network were saved."
+            f"{len(left_out)} of {len(plan)} planned views were left out; {saved} network evaluations were saved."
         )
     decisions += rounds.decisions + sampler_decisions(job, plan, rounds.kept) + totals.decisions
     configs = [group_sampler(job, plan, plan.groups[g]) for g in groups]
