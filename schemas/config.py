@@ -186,9 +186,12 @@ class SceneSource(_Model):
     """One scene of a sweep."""
 
     source: str
-    """Folder of the scene or a procedural spec; $VARIABLES are replaced from the environment."""
+    """Folder of the scene, a pattern of such folders (data/*), or a procedural spec; $VARIABLES are replaced from the
+    environment."""
     reader: str = "auto"
     image_folder: str | None = None
+    obtain: str = ""
+    """A sentence on where the data can be had, said where it is missing."""
     settings: dict[str, Any] = Field(default_factory=dict)
     """Settings of RunConfig for this scene alone, such as {ingest: {downscale: 8}}."""
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from flows.cli import app
 from flows.results import compare
 from flows.sweep import open_jobs, run_sweep, sweep_jobs
-from schemas.config import SweepConfig, merged, parse_config
+from schemas.config import SceneSource, SweepConfig, merged, parse_config
 from schemas.tables import METRICS, TIMINGS, append_rows, read_rows
 
 TRAINER = {
@@ -40,13 +40,28 @@ def test_a_failed_scene_does_not_stop_the_rest_and_a_rerun_does_nothing(tmp_path
     problems = run_sweep(config, tmp_path / "out")
     assert len(problems) == 3
     assert any("transforms.json" in p for p in problems)
-    assert any("CAT3D_NOT_SET is not set" in p for p in problems)
+    assert any("set the environment variable CAT3D_NOT_SET" in p for p in problems)
     assert any("no split for 9 views" in p for p in problems)
     rows = read_rows(tmp_path / "out" / "metrics", METRICS).to_pylist()
     assert {r["run"] for r in rows} == {"v3-zipnerf"}
     before = stages_run(tmp_path / "out")
     run_sweep(config, tmp_path / "out")
     assert stages_run(tmp_path / "out") == before
+
+
+def test_patterns_take_every_scene_there_is_and_missing_ones_say_where_to_get_them(tmp_path: Path) -> None:
+    from tests.flows.test_reprocess import write_photos
+
+    for name in ("b", "a"):
+        write_photos(tmp_path / "data" / name)
+    config = sweep_of(f"{tmp_path}/data/*", splits=["3", "6"])
+    scenes, problems = sweep_jobs(config, tmp_path)
+    assert [(j.scene_id, j.config.split) for jobs in scenes for j in jobs] == [(s, n) for s in "ab" for n in "36"]
+    assert not problems
+    for source in (f"{tmp_path}/none/*", f"{tmp_path}/none", "$CAT3D_NOT_SET/x"):
+        scene = {"source": source, "obtain": "Ask its owner."}
+        _, [problem] = sweep_jobs(sweep_of().model_copy(update={"scenes": (SceneSource(**scene),)}), tmp_path)
+        assert problem.endswith(" Ask its owner.")
 
 
 def test_ablations_and_seeds_are_runs_of_their_own(tmp_path: Path) -> None:
