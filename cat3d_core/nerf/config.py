@@ -53,6 +53,10 @@ class ReconstructConfig:
     weight_decay: float = 0.1
     """Zip-NeRF: 0.1 * 0.5 * mean(v^2) of each grid level, summed over levels; applied in the optimiser."""
 
+    near_gradient: bool = False
+    """Scale gradients of samples at distance t from the camera by min(1, t^2), against floaters in front of cameras
+    (Philip and Deschaintre 2023). The paper states none."""
+
     # Trust in generated views
     distance_falloff: float = 15.0
     """CAT3D: the weight of a generated view is exp(-b s^2), b annealed linearly from 0 to this."""

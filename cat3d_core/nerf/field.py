@@ -70,7 +70,9 @@ class GridDensity(nn.Module):
         features, weights = query(self.table, positions, std, self.layout)
         # Scale feature (Zip-NeRF sec. 2): tells the network how much of a level was weighted away.
         with torch.no_grad():
-            power = torch.stack([self.table[a:b].square().mean() for a, b in self.level_rows()])
+            norms = [torch.linalg.vector_norm(self.table[a:b]) for a, b in self.level_rows()]
+            counts = [(b - a) * self.layout.features for a, b in self.level_rows()]
+            power = torch.stack(norms).square() / torch.tensor(counts, device=weights.device)
             scale = (2.0 * weights - 1.0) * (self.init**2 + power).sqrt()
         inputs = torch.cat([features, scale[..., None]], -1).flatten(1) * self.gain
         hidden = torch.relu(self.hidden(inputs)).view(rays, intervals, -1)

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -110,12 +110,34 @@ def query_rays(
     return torch.cat(densities, 1), parts
 
 
-def composite(field: Field, directions: Tensor, weights: Tensor, parts: list[Part]) -> Tensor:
-    """rgb (R, 3): the colours of the queried intervals, weighted (R, N)."""
+class _ScaleGradient(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, value: Tensor, scale: Tensor) -> Tensor:
+        ctx.save_for_backward(scale)
+        return value.view_as(value)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+        return gradient * ctx.saved_tensors[0], None
+
+
+def near_gradient_scale(t: Tensor, directions: Tensor) -> Tensor:
+    """min(1, distance^2) (R, n) of the middles of intervals with edges t (R, n+1), in scene units: a camera sees what
+    is near it with a density of rays that falls with the square of the distance (Philip and Deschaintre 2023)."""
+    middle = 0.5 * (t[..., 1:] + t[..., :-1]) * directions.norm(dim=-1, keepdim=True)
+    return middle.clamp_max(1.0).square()
+
+
+def composite(
+    field: Field, directions: Tensor, weights: Tensor, parts: list[Part], scale: Tensor | None = None
+) -> Tensor:
+    """rgb (R, 3): the colours of the queried intervals, weighted (R, N); their gradients times `scale` (R, N)."""
     colours = []
     for rows, intervals, hidden in parts:
         seen = slice(None) if rows is None else rows
         colour = field.colour(hidden, directions[seen])
+        if scale is not None:
+            colour = _ScaleGradient.apply(colour, scale[seen, intervals, None])
         colours.append(_spread((weights[seen, intervals, None] * colour).sum(1), rows, len(weights)))
     return colours[0] if len(colours) == 1 else torch.stack(colours).sum(0)
 
@@ -139,6 +161,7 @@ def render_rays(
     logits = torch.zeros_like(s[:, :1])
     rounds: list[Round] = []
     parts: list[Part] = []
+    scale: Tensor | None = None
     for index, samples in enumerate(config.samples):
         s = stepfun.sample_intervals(s, logits, samples, generator)
         t = t_from_s(s, config.near, config.far, config.distance_power, config.distance_premult)
@@ -150,11 +173,14 @@ def render_rays(
                 means, std = cone_samples(*rays, t, config.multisamples, generator)
             lengths = _lengths(t, rays.directions)
             density, parts = query_rays(field.grids[index], means, std, lengths, skip, config.skip_groups)  # type: ignore[arg-type]
+            if trained and config.near_gradient:
+                scale = near_gradient_scale(t, rays.directions)
+                density = _ScaleGradient.apply(density, scale)
             weights = weights_from_density(density, t, rays.directions)
         rounds.append(Round(s, t, weights))
         # The smallest normal number, not 0: a ray without any weight keeps finite logits.
         logits = anneal * weights.detach().clamp_min(torch.finfo(weights.dtype).tiny).log()
-    rgb = composite(field, rays.directions, rounds[-1].weights, parts)
+    rgb = composite(field, rays.directions, rounds[-1].weights, parts, scale)
     opacity = rounds[-1].weights.sum(1)
     low, high = config.background
     if generator is None:

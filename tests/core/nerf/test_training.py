@@ -10,7 +10,13 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.nerf import PRESETS, Field, NonFiniteError, Trainer, Views, losses, render_image
 from cat3d_core.nerf.adam import Adam
 from cat3d_core.nerf.field import encode_directions, safe_exp
-from cat3d_core.nerf.render import Round, normals_from_depth, weights_from_density
+from cat3d_core.nerf.render import (
+    Round,
+    near_gradient_scale,
+    normals_from_depth,
+    render_rays,
+    weights_from_density,
+)
 from cat3d_core.nerf.views import draw_batch
 from cat3d_core.rays import image_rays
 
@@ -289,3 +295,24 @@ def test_normals_of_a_plane_at_any_distance(distance: float) -> None:
     rays = rays._replace(origins=torch.zeros_like(rays.origins))  # next to an origin at 1, 1e-9 would be rounding
     normals = normals_from_depth(torch.full((20, 24), distance), rays)
     torch.testing.assert_close(normals, (-camera.forward[0]).expand(20, 24, 3), rtol=0, atol=1e-4)
+
+
+def test_near_gradients_are_scaled_and_nothing_else_changes() -> None:
+    near, plain = (dataclasses.replace(TINY, near_gradient=on) for on in (True, False))
+    cameras = _views().cameras
+    rays = image_rays(cameras, 0)
+    field = Field(TINY, seed=1)
+    found = []
+    for config, reach in ((plain, 1.0), (near, 1.0), (near, 1e-3)):
+        # Within `reach` of the camera everything is seen: at t = 1e-3 gradients shrink by 1e-6 at least.
+        config = dataclasses.replace(config, far=reach, near=0.0)
+        field.zero_grad(set_to_none=True)
+        out = render_rays(field, rays, config=config)
+        out.rgb.square().sum().backward()
+        found.append((out.rgb.detach(), field.colour.rgb.weight.grad))
+    assert torch.equal(found[0][0], found[1][0])
+    assert found[1][1].norm() < found[0][1].norm()
+    assert 0 < found[2][1].norm() < 1e-5 * found[0][1].norm()
+    t = torch.tensor([[0.0, 0.2, 3.0, 5.0]])
+    scale = near_gradient_scale(t, torch.tensor([[0.0, 0.0, 2.0]]))
+    assert scale[0].tolist() == pytest.approx([0.04, 1.0, 1.0])
