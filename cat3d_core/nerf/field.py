@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from cat3d_core.nerf.config import ReconstructConfig
-from cat3d_core.nerf.coordinates import contract, contracted_std
 from cat3d_core.nerf.hash_grid import make_layout, query
 from cat3d_core.random import generator
 
@@ -60,14 +59,11 @@ class GridDensity(nn.Module):
     def level_rows(self) -> list[tuple[int, int]]:
         return list(zip(self.layout.offsets[:-1], self.layout.offsets[1:], strict=True))
 
-    def forward(self, means: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
-        """Cone samples (R, N, S, 3), (R, N, S) in the scene -> density (R, N) per scene unit, hidden units (R, N,
-        width)."""
+    def forward(self, positions: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
+        """Cone samples (R, N, S, 3), (R, N, S) in the unit cube (`grid_samples`) -> density (R, N) per scene unit,
+        hidden units (R, N, width)."""
         rays, intervals, samples = std.shape
-        # The contracted ball of radius 2 lies in the grid's cube [-2, 2]^3.
-        positions = (contract(means) * 0.25 + 0.5).view(-1, samples, 3)
-        std = (contracted_std(means, std) * 0.25).view(-1, samples)
-        features, weights = query(self.table, positions, std, self.layout)
+        features, weights = query(self.table, positions.reshape(-1, samples, 3), std.reshape(-1, samples), self.layout)
         # Scale feature (Zip-NeRF sec. 2): tells the network how much of a level was weighted away.
         with torch.no_grad():
             norms = [torch.linalg.vector_norm(self.table[a:b]) for a, b in self.level_rows()]

@@ -1,72 +1,21 @@
-"""The fused hash grid query as a small C++ kernel, compiled by g++ on first use and called through ctypes."""
+"""The fused hash grid query as a small C++ kernel (hash_grid.cpp)."""
 
 from __future__ import annotations
 
 import ctypes
 import functools
-import hashlib
-import os
-import platform
-import subprocess
-import tempfile
-import warnings
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from cat3d_core.nerf.cpu_library import library, pointer
 from cat3d_core.nerf.hash_grid import GridLayout
-
-_SOURCE = Path(__file__).with_name("hash_grid.cpp")
-_FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fopenmp", "-shared", "-fPIC", "-std=c++17")
-
-
-def _processor() -> str:
-    """What -march=native depends on, so that a cache on a shared disk serves unlike machines."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return "\n".join(sorted({line for line in lines if line.startswith(("model name", "flags"))}))
-    except OSError:
-        return platform.processor()
-
-
-def _compile() -> Path:
-    """Path of the shared library for this source and processor, compiled where the cache lacks it."""
-    compiler = os.environ.get("CXX", "g++")
-    key = hashlib.sha256(_SOURCE.read_bytes() + repr((compiler, _FLAGS, _processor())).encode()).hexdigest()[:24]
-    folder = Path(os.environ.get("CAT3D_CACHE") or Path.home() / ".cache" / "cat3d")
-    library = folder / f"hash_grid-{key}.so"
-    if not library.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder) as scratch:
-            built = Path(scratch) / library.name
-            subprocess.run(
-                [compiler, *_FLAGS, str(_SOURCE), "-o", str(built)], check=True, capture_output=True, text=True
-            )
-            os.replace(built, library)  # atomic: another process sees all of it or nothing
-    return library
-
-
-@functools.cache
-def _load() -> ctypes.CDLL | None:
-    try:
-        library = ctypes.CDLL(str(_compile()))
-    except (OSError, subprocess.CalledProcessError) as error:
-        detail = getattr(error, "stderr", None) or error
-        warnings.warn(
-            f"The CPU hash grid kernel could not be compiled, so the plain torch reference runs (over 10x slower): "
-            f"{detail}. Install g++ with OpenMP, or name a compiler in CXX.",
-            stacklevel=2,
-        )
-        return None
-    library.hash_grid.restype = ctypes.c_int
-    return library
 
 
 def available() -> bool:
     """Whether the kernel is there; compiles it at the first call and warns once where that fails."""
-    return _load() is not None
+    return library("hash_grid") is not None
 
 
 @functools.cache
@@ -79,10 +28,6 @@ def _levels(layout: GridLayout) -> Any:
     return (ctypes.c_int64 * len(flat))(*flat)
 
 
-def _pointer(tensor: Tensor | None) -> ctypes.c_void_p:
-    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
-
-
 def _call(
     backward: bool,
     source: Tensor,
@@ -92,10 +37,10 @@ def _call(
     weights: Tensor | None,
     layout: GridLayout,
 ) -> None:
-    library = _load()
-    assert library is not None
-    status = library.hash_grid(
-        ctypes.c_int(backward), _pointer(source), _pointer(positions), _pointer(std), _pointer(out), _pointer(weights),
+    kernels = library("hash_grid")
+    assert kernels is not None
+    status = kernels.hash_grid(
+        ctypes.c_int(backward), pointer(source), pointer(positions), pointer(std), pointer(out), pointer(weights),
         _levels(layout), ctypes.c_int(layout.levels), ctypes.c_int(layout.features),
         ctypes.c_int64(std.shape[0]), ctypes.c_int(std.shape[1]), ctypes.c_int(torch.get_num_threads()),
     )  # fmt: skip

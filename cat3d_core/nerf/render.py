@@ -16,7 +16,7 @@ from cat3d_core.nerf import stepfun
 from cat3d_core.nerf.config import ReconstructConfig
 from cat3d_core.nerf.coordinates import t_from_s
 from cat3d_core.nerf.field import Field, GridDensity
-from cat3d_core.nerf.frustums import cone_samples
+from cat3d_core.nerf.frustums import grid_samples
 from cat3d_core.rays import Rays, image_rays
 
 
@@ -81,7 +81,7 @@ def _spread(values: Tensor, rows: Tensor | None, count: int) -> Tensor:
 
 
 def query_rays(
-    grid: GridDensity, means: Tensor, std: Tensor, lengths: Tensor, bound: float, groups: int
+    grid: GridDensity, positions: Tensor, std: Tensor, lengths: Tensor, bound: float, groups: int
 ) -> tuple[Tensor, list[Part]]:
     """Density (R, N) of intervals with these samples (R, N, S, 3), (R, N, S) and lengths (R, N), and what was queried.
 
@@ -91,7 +91,7 @@ def query_rays(
     """
     count, intervals = lengths.shape
     if not bound:
-        density, hidden = grid(means, std)
+        density, hidden = grid(positions, std)
         return density, [Part(None, slice(None), hidden)]
     edges = [round(intervals * i / groups) for i in range(groups + 1)]
     depth, rows = torch.zeros_like(lengths[:, 0]), None
@@ -103,7 +103,7 @@ def query_rays(
             if not len(rows):
                 densities.append(torch.zeros_like(lengths[:, first:]))
                 break
-        density, hidden = grid(*(x[:, part] if rows is None else x[rows, part] for x in (means, std)))
+        density, hidden = grid(*(x[:, part] if rows is None else x[rows, part] for x in (positions, std)))
         densities.append(_spread(density, rows, count))
         parts.append(Part(rows, part, hidden))
         depth = depth + (densities[-1].detach() * lengths[:, part]).sum(1)
@@ -169,10 +169,9 @@ def render_rays(
         # A proposal that trains has to be seen whole: where it is 0, its loss would be unbounded.
         skip = 0.0 if trained and index < config.rounds - 1 else config.skip_transmittance
         with torch.set_grad_enabled(trained):
-            with torch.no_grad():
-                means, std = cone_samples(*rays, t, config.multisamples, generator)
+            positions, std = grid_samples(rays, t, config.multisamples, generator)
             lengths = _lengths(t, rays.directions)
-            density, parts = query_rays(field.grids[index], means, std, lengths, skip, config.skip_groups)  # type: ignore[arg-type]
+            density, parts = query_rays(field.grids[index], positions, std, lengths, skip, config.skip_groups)  # type: ignore[arg-type]
             if trained and config.near_gradient:
                 scale = near_gradient_scale(t, rays.directions)
                 density = _ScaleGradient.apply(density, scale)

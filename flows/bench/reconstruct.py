@@ -147,19 +147,44 @@ def _timed(run: Callable[[], Any], device: str) -> float:
     return time.perf_counter() - started
 
 
-def kernels(rays: int = 1024, log2_table: int = 16, repeats: int = 5, device: str = "cpu") -> list[dict[str, Any]]:
-    """Grid queries of one step of the paper's sampling (64 + 64 + 32 intervals of 6 samples), forward and backward.
+#: Workloads of `kernels`: the sampling of one step of a preset, and the size of its tables (None: the preset's own).
+WORKLOADS: tuple[tuple[str, int | None], ...] = (("fast", None), ("paper", 16))
+
+
+def kernels(
+    rays: int = 4096, repeats: int = 3, device: str = "cpu", threads: Sequence[int] = (1, 2)
+) -> list[dict[str, Any]]:
+    """Grid queries of one training step, forward and backward, for each of WORKLOADS and on as many threads.
 
     The kernels take turns, so that a busy machine slows all alike; each time is the best of `repeats`. `ratio` is
-    against the torch reference. `floor_share` is the least time memory needs (positions and std read, features and
-    weights written, 8 corners of each sample and level gathered once; backward scatters them) over the time taken; a
-    share above 1 means that the corners came from the cache.
+    against the torch reference; the rows of all grids sum up a step. `floor_share` is the least time memory needs
+    (positions and std read, features and weights written, 8 corners of each sample and level gathered once; backward
+    scatters them) over the time taken; a share above 1 means that the corners came from the cache.
     """
-    bandwidth = _copy_bandwidth(device)
+    before, rows = torch.get_num_threads(), []
+    try:
+        for count in threads if device == "cpu" else (before,):
+            torch.set_num_threads(count)
+            bandwidth = _copy_bandwidth(device)
+            for preset, log2_table in WORKLOADS:
+                common = {"workload": preset, "threads": count, "rays": rays}
+                rows += [
+                    common | row for row in _workload(PRESETS[preset], log2_table, rays, repeats, device, bandwidth)
+                ]
+    finally:
+        torch.set_num_threads(before)
+    return rows
+
+
+def _workload(
+    config: ReconstructConfig, log2_table: int | None, rays: int, repeats: int, device: str, bandwidth: float
+) -> list[dict[str, Any]]:
     generator = torch.Generator().manual_seed(0)
-    rows = []
-    for max_resolution, features, intervals in ((512, 1, 64), (2048, 1, 64), (8192, 4, 32)):
-        layout = make_layout(16, max_resolution, log2_table, features)
+    log2_table = log2_table or config.grid_log2_table
+    rows: list[dict[str, Any]] = []
+    total: dict[tuple[str, str], float] = {}
+    for max_resolution, features, intervals in zip(config.grid_max, config.grid_features, config.samples, strict=True):
+        layout = make_layout(config.grid_base, max_resolution, log2_table, features)
         # Samples along rays through the cube, their spread that of a pixel of a 512-pixel image.
         start = torch.rand((rays, 1, 1, 3), generator=generator)
         end = torch.rand((rays, 1, 1, 3), generator=generator)
@@ -168,47 +193,45 @@ def kernels(rays: int = 1024, log2_table: int = 16, repeats: int = 5, device: st
         std = (1e-4 + 1e-3 * along[..., 0]).expand(rays, -1, -1).reshape(-1, 6).to(device)
         table = torch.randn((layout.rows, features), generator=generator).to(device).requires_grad_()
         gradient = torch.randn((rays * intervals, layout.levels, features), generator=generator).to(device)
-        best: dict[tuple[str, str], float] = {}
-        for _ in range(repeats):
-            for name, query in _kernels(device).items():
-                table.grad = None
-                kept: list[Tensor] = []
-
-                def forward(query: Query = query, kept: list[Tensor] = kept) -> None:
-                    kept.append(query(table, positions, std, layout)[0])  # noqa: B023
-
-                def backward(kept: list[Tensor] = kept) -> None:
-                    kept[0].backward(gradient)  # noqa: B023
-
-                for phase, run in (("forward", forward), ("backward", backward)):
-                    best[name, phase] = min(best.get((name, phase), math.inf), _timed(run, device))
+        best = _best_times(table, positions, std, layout, gradient, repeats, device)
         count = rays * intervals
         corners = count * 6 * 8 * layout.levels * features * 4
         moved = count * (6 * 16 + layout.levels * (features + 1) * 4)
+        grid = f"2^{log2_table} to {max_resolution}, F={features}"
         for (name, phase), seconds in best.items():
+            total[name, phase] = total.get((name, phase), 0.0) + seconds
             floor = (moved + corners * (1 if phase == "forward" else 2)) / bandwidth
-            row = {
-                "grid": f"2^{log2_table} to {max_resolution}, F={features}",
-                "intervals_per_ray": intervals,
-                "phase": phase,
-                "kernel": name,
-                "ms": seconds * 1e3,
-                "rays_per_s": rays / seconds,
-                "ratio": best["torch reference", phase] / seconds,
-                "floor_share": floor / seconds,
-            }
-            rows.append(row)
-        for name in _kernels(device):
-            total, reference = (sum(best[k, p] for p in ("forward", "backward")) for k in (name, "torch reference"))
-            rows.append(
-                {
-                    "grid": f"2^{log2_table} to {max_resolution}, F={features}",
-                    "intervals_per_ray": intervals,
-                    "phase": "both",
-                    "kernel": name,
-                    "ms": total * 1e3,
-                    "rays_per_s": rays / total,
-                    "ratio": reference / total,
-                }
-            )
+            rows.append(_kernel_row(grid, phase, name, rays, seconds, best["torch reference", phase])
+                        | {"intervals_per_ray": intervals, "floor_share": floor / seconds})  # fmt: skip
+    for name in _kernels(device):
+        for phase in ("forward", "backward", "both"):
+            phases = ("forward", "backward") if phase == "both" else (phase,)
+            seconds, reference = (sum(total[k, p] for p in phases) for k in (name, "torch reference"))
+            rows.append(_kernel_row("all", phase, name, rays, seconds, reference))
     return rows
+
+
+def _kernel_row(grid: str, phase: str, kernel: str, rays: int, seconds: float, reference: float) -> dict[str, Any]:
+    return {"grid": grid, "phase": phase, "kernel": kernel, "ms": seconds * 1e3, "rays_per_s": rays / seconds,
+            "ratio": reference / seconds}  # fmt: skip
+
+
+def _best_times(
+    table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout, gradient: Tensor, repeats: int, device: str
+) -> dict[tuple[str, str], float]:
+    """(kernel, phase) -> seconds."""
+    best: dict[tuple[str, str], float] = {}
+    for _ in range(repeats):
+        for name, query in _kernels(device).items():
+            table.grad = None
+            kept: list[Tensor] = []
+
+            def forward(query: Query = query, kept: list[Tensor] = kept) -> None:
+                kept.append(query(table, positions, std, layout)[0])
+
+            def backward(kept: list[Tensor] = kept) -> None:
+                kept.pop().backward(gradient)
+
+            for phase, run in (("forward", forward), ("backward", backward)):
+                best[name, phase] = min(best.get((name, phase), math.inf), _timed(run, device))
+    return best

@@ -130,7 +130,7 @@ def geometry_rows(quick: bool, data: Path | None) -> list[Row]:
 def kernel_rows(quick: bool, data: Path | None) -> list[Row]:
     rows = []
     for device in _devices():
-        found = reconstruct.kernels(256 if quick else 1024, repeats=2 if quick else 5, device=device)
+        found = reconstruct.kernels(256 if quick else 4096, repeats=2 if quick else 3, device=device)
         rows += [{"device": device} | row for row in found]
     return rows
 

@@ -22,7 +22,7 @@ from flows.stages.common import read_cameras, read_images, views_with_role
 from schemas.errors import ConfigError
 from schemas.scene_store import Run, SceneStore
 
-VERSION = 1
+VERSION = 2
 CHECKPOINT_INTERVAL_S = 20.0
 #: `skip.rays`: steps that see as many rays as there are pixels, at least, and the fewest rays of a step.
 PASSES, FEWEST_RAYS = 24, 256

@@ -5,7 +5,16 @@ import math
 import pytest
 import torch
 
-from cat3d_core.nerf.frustums import cone_samples, perpendicular_basis, sample_distances
+from cat3d_core.nerf import frustums
+from cat3d_core.nerf.cpu_library import library
+from cat3d_core.nerf.frustums import (
+    cone_samples,
+    grid_samples,
+    grid_samples_reference,
+    perpendicular_basis,
+    sample_distances,
+)
+from cat3d_core.rays import Rays
 
 
 @pytest.mark.parametrize("count", [3, 6])
@@ -71,3 +80,42 @@ def test_finite_at_the_camera_and_far_away_and_deterministic_without_generator()
 def test_other_counts_are_refused() -> None:
     with pytest.raises(ValueError, match="6 or 3"):
         cone_samples(torch.zeros(1, 3), torch.ones(1, 3), torch.ones(1, 1), torch.tensor([[0.0, 1.0]]), 4)
+
+
+@pytest.mark.skipif(library("cone_samples") is None, reason="There is no C++ compiler here.")
+@pytest.mark.parametrize("count", [3, 6])
+@pytest.mark.parametrize("intervals", [1, 16, 37])
+@pytest.mark.parametrize("seed", [None, 0])
+def test_cpu_kernel_matches_float64(count: int, intervals: int, seed: int | None) -> None:
+    draw = torch.Generator().manual_seed(7)
+    origins = torch.randn((50, 3), generator=draw)
+    directions = torch.randn((50, 3), generator=draw) + torch.tensor([0.0, 0.0, 1.0])
+    radii = 10 ** (torch.rand((50, 1), generator=draw) * 3 - 4)
+    # From the camera to 1e6, as the power ladder has it.
+    t = torch.cat([torch.zeros(50, 1), 10 ** (torch.rand((50, intervals), generator=draw) * 8 - 2)], 1).sort(1).values
+    t[0] = 0.0  # an interval without width at the camera
+    rays = Rays(origins, directions, radii)
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        generator = None if seed is None else torch.Generator().manual_seed(seed)
+        flip, turn = frustums._spirals(t, generator)
+        with pytest.MonkeyPatch.context() as patch:  # the same random numbers at both precisions
+            patch.setattr(frustums, "_spirals", lambda *_, f=flip, u=turn, d=dtype: (f.to(d), u.to(d)))
+            found.append(frustums.grid_samples(Rays(*(x.to(dtype) for x in rays)), t.to(dtype), count))
+    (positions, std), (exact, exact_std) = found
+    assert positions.dtype == torch.float32
+    torch.testing.assert_close(positions.double(), exact, rtol=0, atol=1e-6)
+    torch.testing.assert_close(std.double(), exact_std, rtol=2e-5, atol=1e-12)
+
+
+@pytest.mark.skipif(library("cone_samples") is None, reason="There is no C++ compiler here.")
+def test_cpu_kernel_draws_as_the_reference_and_passes_nan_on() -> None:
+    rays = Rays(torch.zeros(4, 3), torch.eye(3)[[0, 1, 2, 2]], torch.full((4, 1), 0.01))
+    t = torch.linspace(0.1, 3, 20).expand(4, 20).contiguous()
+    runs = [f(rays, t, 6, torch.Generator().manual_seed(1)) for f in (grid_samples, grid_samples_reference)]
+    for got, expected in zip(*runs, strict=True):
+        torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-6)
+    broken = grid_samples(rays._replace(origins=torch.full((4, 3), torch.nan)), t)
+    assert all(part.isnan().all() for part in broken)
+    with pytest.raises(ValueError, match="6 or 3 samples"):
+        grid_samples(rays, t, 5)

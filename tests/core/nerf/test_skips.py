@@ -8,7 +8,7 @@ import torch
 
 from cat3d_core.nerf import PRESETS, Trainer, render_image
 from cat3d_core.nerf.field import GridDensity
-from cat3d_core.nerf.frustums import cone_samples
+from cat3d_core.nerf.frustums import grid_samples
 from cat3d_core.nerf.render import query_rays, render_rays, weights_from_density
 from cat3d_core.rays import image_rays
 from tests.core.nerf.test_training import TINY, _views
@@ -77,12 +77,12 @@ def test_skipped_intervals_carry_no_more_gradient_than_the_bound(bound: float) -
         grid.density.bias += 2.5
     rays = image_rays(_views().cameras, 0)
     t = torch.linspace(0.2, 2.5, 17).expand(len(rays.origins), 17)
-    means, std = cone_samples(*rays, t, 6)
+    positions, std = grid_samples(rays, t)
     lengths = t.diff(dim=-1) * rays.directions.norm(dim=-1, keepdim=True)
     target = torch.rand((len(t), 16), generator=generator)
     found = []
     for limit in (0.0, bound):
-        density, parts = query_rays(grid, means, std, lengths, limit, 4)
+        density, parts = query_rays(grid, positions, std, lengths, limit, 4)
         weights = weights_from_density(density, t, rays.directions)
         (gradient,) = torch.autograd.grad((weights * target).sum(), density)
         found.append((weights, gradient, sum(part.hidden.shape[0] * part.hidden.shape[1] for part in parts)))

@@ -1,0 +1,75 @@
+"""Small C++ kernels: compiled by g++ on first use, cached by source and processor, called through ctypes."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import platform
+import subprocess
+import tempfile
+import warnings
+from pathlib import Path
+
+from torch import Tensor
+
+_FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fopenmp", "-shared", "-fPIC", "-std=c++17")
+
+
+def _processor() -> str:
+    """What -march=native depends on, so that a cache on a shared disk serves unlike machines."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return "\n".join(sorted({line for line in lines if line.startswith(("model name", "flags"))}))
+    except OSError:
+        return platform.processor()
+
+
+def _compile(name: str) -> Path:
+    """Path of the shared library of this folder's NAME.cpp for this processor, compiled where the cache lacks it."""
+    source = Path(__file__).with_name(f"{name}.cpp")
+    compiler = os.environ.get("CXX", "g++")
+    key = hashlib.sha256(source.read_bytes() + repr((compiler, _FLAGS, _processor())).encode()).hexdigest()[:24]
+    folder = Path(os.environ.get("CAT3D_CACHE") or Path.home() / ".cache" / "cat3d")
+    library = folder / f"{name}-{key}.so"
+    if not library.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            built = Path(scratch) / library.name
+            subprocess.run(
+                [compiler, *_FLAGS, str(source), "-o", str(built)], check=True, capture_output=True, text=True
+            )
+            os.replace(built, library)  # atomic: another process sees all of it or nothing
+    return library
+
+
+@functools.cache
+def _load(name: str) -> ctypes.CDLL | str:
+    try:
+        return ctypes.CDLL(str(_compile(name)))
+    except (OSError, subprocess.CalledProcessError) as error:
+        return str(getattr(error, "stderr", None) or error)
+
+
+@functools.cache
+def _warn(problem: str) -> None:
+    warnings.warn(
+        f"The CPU kernels could not be compiled, so the plain torch reference runs (over 10x slower): {problem}. "
+        "Install g++ with OpenMP, or name a compiler in CXX.",
+        stacklevel=3,
+    )
+
+
+def library(name: str) -> ctypes.CDLL | None:
+    """The kernels of NAME.cpp; compiles them at the first call. None where that fails, with one warning."""
+    found = _load(name)
+    if isinstance(found, str):
+        _warn(found)
+        return None
+    return found
+
+
+def pointer(tensor: Tensor | None) -> ctypes.c_void_p:
+    """The address of a contiguous tensor's data; null for None."""
+    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
