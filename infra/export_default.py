@@ -3,7 +3,9 @@
     cat3d train default --out WORK --set bank.textures=PHOTOS   # hours on two CPU cores, minutes on a GPU; resumable
     python infra/export_default.py WORK --scenes 20             # 20 held-out scenes of each family
 
-`--scenes 0` leaves the evaluation out. Start the next training from the shipped weights: `--set start=FILE`.
+`--refine 5` first trains the decoder alone for 5 minutes with the perceptual distance that is on this machine; latents
+stay what they are. `--scenes 0` leaves the evaluation out. Start the next training from the shipped weights:
+`--set start=FILE`.
 """
 
 from __future__ import annotations
@@ -11,26 +13,55 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from cat3d_core.diffusion import describe, load_model, save_model
+from cat3d_core.diffusion import MultiViewModel, describe, load_model, save_model
+from cat3d_core.metrics.perceptual import find_perceptual
 from flows.bench.model import evaluate_file
+from flows.training.autoencoder import reconstruction_psnr, refine_decoder
+from flows.training.prepare import read_photos
+from flows.training.renders import rendered_images
 
 ROOT = Path(__file__).resolve().parents[1]
 WEIGHTS, CARD = ROOT / "cat3d_core" / "weights" / "default.safetensors", ROOT / "docs" / "model_card.md"
 START, END = "<!-- numbers: written by infra/export_default.py -->", "<!-- end of numbers -->"
+HELD_OUT_PHOTOS = 6  # for the autoencoder's test
 # What a briefly trained model is at its best with (docs/model_card.md); runs take it from the file.
 SAMPLER = {"solver": "ddim", "nodes": "trailing", "steps": 4, "guidance": 1.0}
 
 
-def export(model: Path, scenes: int, pictures: Path, data: Path | None) -> None:
-    """`model` in float16 as the shipped one; evaluated on `scenes` held-out scenes a family (0: not), and on the
-    captured scenes in `data`."""
-    provenance = describe(model)["provenance"] | {"sampler": SAMPLER}
-    digest = save_model(WEIGHTS, load_model(model), provenance, torch.float16)
+def refine(model: MultiViewModel, training: dict[str, Any], work: Path, minutes: float) -> dict[str, Any]:
+    """Refine the model's decoder on the bank's renders and the photographs of its training; what was done."""
+    perceptual = find_perceptual()
+    if perceptual is None:
+        raise SystemExit("--refine needs the weights of a perceptual distance (README, 'Perceptual metrics').")
+    bank = training["bank"]
+    pictures = rendered_images(Path(bank["folder"] or work), 8192)
+    photos = read_photos(Path(bank["textures"])) if bank["textures"] else None
+    held_out, photos = pictures[-256:].float() / 255, None if photos is None else photos[:-HELD_OUT_PHOTOS]
+    before = model.autoencoder
+    model.autoencoder = refine_decoder(before, pictures[:-256], photos, 60 * minutes, perceptual)
+    scores = {}
+    for name, autoencoder in (("before", before), ("after", model.autoencoder)):
+        decoded = autoencoder.decode(autoencoder.encode(held_out[:64]))
+        scores[name] = {"psnr": reconstruction_psnr(autoencoder, held_out),
+                        perceptual.name: float(perceptual(decoded, held_out[:64]).mean())}  # fmt: skip
+    return {"minutes": minutes, "perceptual": perceptual.name, "renders": scores}
+
+
+def export(work: Path, scenes: int, data: Path | None, refine_minutes: float) -> None:
+    """The model of `work` in float16 as the shipped one; evaluated on `scenes` held-out scenes a family (0: not), and
+    on the captured scenes in `data`."""
+    source = work / "model.safetensors"
+    model, provenance = load_model(source), describe(source)["provenance"] | {"sampler": SAMPLER}
+    if refine_minutes:
+        provenance["decoder_refined"] = refine(model, provenance["training"], work, refine_minutes)
+        print(provenance["decoder_refined"])
+    digest = save_model(WEIGHTS, model, provenance, torch.float16)
     WEIGHTS.chmod(0o644)
-    tables = evaluate_file(WEIGHTS, scenes, pictures=pictures, data=data) if scenes else "Not evaluated yet."
+    tables = evaluate_file(WEIGHTS, scenes, pictures=work / "pictures", data=data) if scenes else "Not evaluated yet."
     facts = (
         f"Exported {time.strftime('%Y-%m-%d %H:%M')}; this training: {provenance['groups_of_views']:,} groups of views "
         f"in {provenance['steps']:,} steps, {provenance['hours']} hours; file {WEIGHTS.stat().st_size / 1e6:.1f} MB; "
@@ -46,9 +77,10 @@ def main() -> None:
     parser.add_argument("work", type=Path, help="the folder of a finished (or running) `cat3d train`")
     parser.add_argument("--scenes", type=int, default=20, help="held-out scenes of each family")
     parser.add_argument("--data", type=Path, help="folder with captured scenes to evaluate on too")
+    parser.add_argument("--refine", type=float, default=0.0, help="minutes of training the decoder alone first")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    export(options.work / "model.safetensors", options.scenes, options.work / "pictures", options.data)
+    export(options.work, options.scenes, options.data, options.refine)
 
 
 if __name__ == "__main__":

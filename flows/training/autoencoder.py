@@ -136,6 +136,7 @@ def refine_decoder(
         optimizer.step()
         step, passed = step + 1, (time.monotonic() - start) / seconds
         report(min(passed, 1.0), pixels.item(), distance.item())
+    model.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
     return model.eval().requires_grad_(False)
 
 

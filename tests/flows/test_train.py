@@ -327,16 +327,15 @@ def test_settings_reach_nested_fields() -> None:
 
 @pytest.mark.slow
 def test_the_recipe_in_short_follows_the_cameras(tmp_path: Path) -> None:
-    """A sixth of the 10-minute recipe: the loss falls, and samples look like the views from their own cameras more than
-    like the other targets' views, of which a model blind to cameras could not tell them. The second half was not
-    reached by the one run of the recipe so far (docs/training.md), so it is reported and not required."""
-    settings = ["bank.scenes=120", "autoencoder.minutes=0.75", "sample_scenes=8", "log_steps=25"]
-    run("recipe_10_minutes", "--out", tmp_path, "--steps", "600", *[a for s in settings for a in ("--set", s)])
+    """A third of the 10-minute recipe: the loss falls, and samples look like the views from their own cameras more than
+    like the other targets' views, of which a model blind to cameras could not tell them (chance: 0 dB, matched 0.2)."""
+    settings = ["bank.scenes=120", "autoencoder.minutes=0.75", "sample_scenes=12", "log_steps=25", "sample_minutes=60"]
+    run("recipe_10_minutes", "--out", tmp_path, "--steps", "700", *[a for s in settings for a in ("--set", s)])
     losses = [row["loss"] for row in read_rows(tmp_path / "training", TRAINING).to_pylist()]
-    assert sum(losses[-4:]) / 4 < 0.75 * losses[0]
-    samples = read_rows(tmp_path / "samples", SAMPLES).to_pylist()[-2:]
-    assert {one["step"] for one in samples} == {600}
-    gain_db = sum(one["psnr_right_db"] - one["psnr_wrong_db"] for one in samples) / 2
-    matched = sum(one["matched"] for one in samples) / 2  # by chance 0.2
-    if gain_db <= 0.5 or matched <= 0.3:
-        pytest.xfail(f"The samples don't follow the cameras yet: {gain_db:.2f} dB, matched {matched:.2f}.")
+    assert sum(losses[-4:]) / 4 < 0.6 * losses[0]
+    samples = read_rows(tmp_path / "samples", SAMPLES).to_pylist()
+    assert {one["step"] for one in samples} == {700}
+    gain_db = sum(one["psnr_right_db"] - one["psnr_wrong_db"] for one in samples) / len(samples)
+    matched = sum(one["matched"] for one in samples) / len(samples)
+    assert gain_db > 0.15
+    assert matched > 0.25
