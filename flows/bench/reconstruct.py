@@ -19,6 +19,7 @@ from cat3d_core.nerf.hash_grid import GridLayout, make_layout, query_reference
 from cat3d_core.normalization import normalize_scene
 from cat3d_core.synthetic import random_cameras, random_scene, trace
 
+Times = tuple[float, float]  # wall and processor seconds
 Query = Callable[[Tensor, Tensor, Tensor, GridLayout], tuple[Tensor, Tensor]]
 
 #: What `curves` varies, one at a time, around a preset.
@@ -135,16 +136,17 @@ def _copy_bandwidth(device: str) -> float:
     """Bytes per second of a large copy (read + write), the best of five."""
     source = torch.zeros(2**26, device=device)
     target = torch.empty_like(source)
-    seconds = min(_timed(lambda: target.copy_(source), device) for _ in range(5))
+    seconds = min(_timed(lambda: target.copy_(source), device)[0] for _ in range(5))
     return 2 * source.numel() * 4 / seconds
 
 
-def _timed(run: Callable[[], Any], device: str) -> float:
-    started = time.perf_counter()
+def _timed(run: Callable[[], Any], device: str) -> tuple[float, float]:
+    """Wall seconds, and processor seconds of all threads."""
+    started, used = time.perf_counter(), time.process_time()
     run()
     if device == "cuda":
         torch.cuda.synchronize()
-    return time.perf_counter() - started
+    return time.perf_counter() - started, time.process_time() - used
 
 
 #: Workloads of `kernels`: the sampling of one step of a preset, and the size of its tables (None: the preset's own).
@@ -157,7 +159,8 @@ def kernels(
     """Grid queries of one training step, forward and backward, for each of WORKLOADS and on as many threads.
 
     The kernels take turns, so that a busy machine slows all alike; each time is the best of `repeats`. `ratio` is
-    against the torch reference; the rows of all grids sum up a step. `floor_share` is the least time memory needs
+    against the torch reference; `cpu_ratio` by processor time, which other jobs on the machine lengthen less. The rows
+    of all grids sum up a step. `floor_share` is the least time memory needs
     (positions and std read, features and weights written, 8 corners of each sample and level gathered once; backward
     scatters them) over the time taken; a share above 1 means that the corners came from the cache.
     """
@@ -182,7 +185,7 @@ def _workload(
     generator = torch.Generator().manual_seed(0)
     log2_table = log2_table or config.grid_log2_table
     rows: list[dict[str, Any]] = []
-    total: dict[tuple[str, str], float] = {}
+    total: dict[tuple[str, str], Times] = {}
     for max_resolution, features, intervals in zip(config.grid_max, config.grid_features, config.samples, strict=True):
         layout = make_layout(config.grid_base, max_resolution, log2_table, features)
         # Samples along rays through the cube, their spread that of a pixel of a 512-pixel image.
@@ -198,29 +201,35 @@ def _workload(
         corners = count * 6 * 8 * layout.levels * features * 4
         moved = count * (6 * 16 + layout.levels * (features + 1) * 4)
         grid = f"2^{log2_table} to {max_resolution}, F={features}"
-        for (name, phase), seconds in best.items():
-            total[name, phase] = total.get((name, phase), 0.0) + seconds
+        for (name, phase), times in best.items():
+            total[name, phase] = _sum([total.get((name, phase), (0.0, 0.0)), times])
             floor = (moved + corners * (1 if phase == "forward" else 2)) / bandwidth
-            rows.append(_kernel_row(grid, phase, name, rays, seconds, best["torch reference", phase])
-                        | {"intervals_per_ray": intervals, "floor_share": floor / seconds})  # fmt: skip
+            rows.append(_kernel_row(grid, phase, name, rays, times, best["torch reference", phase])
+                        | {"intervals_per_ray": intervals, "floor_share": floor / times[0]})  # fmt: skip
     for name in _kernels(device):
         for phase in ("forward", "backward", "both"):
             phases = ("forward", "backward") if phase == "both" else (phase,)
-            seconds, reference = (sum(total[k, p] for p in phases) for k in (name, "torch reference"))
-            rows.append(_kernel_row("all", phase, name, rays, seconds, reference))
+            times, reference = (_sum([total[k, p] for p in phases]) for k in (name, "torch reference"))
+            rows.append(_kernel_row("all", phase, name, rays, times, reference))
     return rows
 
 
-def _kernel_row(grid: str, phase: str, kernel: str, rays: int, seconds: float, reference: float) -> dict[str, Any]:
-    return {"grid": grid, "phase": phase, "kernel": kernel, "ms": seconds * 1e3, "rays_per_s": rays / seconds,
-            "ratio": reference / seconds}  # fmt: skip
+def _sum(times: Sequence[Times]) -> Times:
+    return sum(wall for wall, _ in times), sum(cpu for _, cpu in times)
+
+
+def _kernel_row(grid: str, phase: str, kernel: str, rays: int, times: Times, reference: Times) -> dict[str, Any]:
+    return {
+        "grid": grid, "phase": phase, "kernel": kernel, "ms": times[0] * 1e3, "cpu_ms": times[1] * 1e3,
+        "rays_per_s": rays / times[0], "ratio": reference[0] / times[0], "cpu_ratio": reference[1] / times[1],
+    }  # fmt: skip
 
 
 def _best_times(
     table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout, gradient: Tensor, repeats: int, device: str
-) -> dict[tuple[str, str], float]:
-    """(kernel, phase) -> seconds."""
-    best: dict[tuple[str, str], float] = {}
+) -> dict[tuple[str, str], Times]:
+    """(kernel, phase) -> the best times."""
+    best: dict[tuple[str, str], Times] = {}
     for _ in range(repeats):
         for name, query in _kernels(device).items():
             table.grad = None
@@ -233,5 +242,6 @@ def _best_times(
                 kept.pop().backward(gradient)
 
             for phase, run in (("forward", forward), ("backward", backward)):
-                best[name, phase] = min(best.get((name, phase), math.inf), _timed(run, device))
+                last = best.get((name, phase), (math.inf, math.inf))
+                best[name, phase] = tuple(map(min, last, _timed(run, device)))  # type: ignore[assignment]
     return best
