@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from cat3d_core.diffusion.checkpoint import describe
 from cat3d_core.metrics.perceptual import find_perceptual
 from cat3d_core.nerf import PRESETS
 from cat3d_core.weights import default_model_path
-from flows.bench import metrics, model, plan, poses, reconstruct, sampler, skips, store, synthetic
+from flows.bench import metrics, model, plan, poses, reconstruct, sampler, scenes, skips, store, synthetic
 from flows.images import read_image
 from flows.readers import read_capture
 from flows.readers.base import InputError
@@ -120,6 +120,16 @@ def reconstruct_rows(quick: bool, data: Path | None) -> list[Row]:
     return _marked(rows, {"preset": default, "varied": "preset", "iterations": whole})
 
 
+def scene_rows(quick: bool, data: Path | None) -> list[Row]:
+    """All training views of real scenes, captured views only, at the default preset; quick: a tenth of it on one."""
+    default: str = ReconstructConfig().preset
+    config = replace(PRESETS[default], lpips_weight=0.0)
+    if quick:
+        config = replace(config, iterations=config.iterations // 10, warmup_iterations=config.warmup_iterations // 10)
+    found = _scenes(data, ["llff_fern"] if quick else list(scenes.DOWNSCALE))
+    return [{"preset": default} | scenes.row(scene, "all", config, scenes.DOWNSCALE[scene.name]) for scene in found]
+
+
 def geometry_rows(quick: bool, data: Path | None) -> list[Row]:
     from flows.bench import geometry  # Open3D, which nothing else here needs
 
@@ -130,7 +140,7 @@ def geometry_rows(quick: bool, data: Path | None) -> list[Row]:
 def kernel_rows(quick: bool, data: Path | None) -> list[Row]:
     rows = []
     for device in _devices():
-        found = reconstruct.kernels(256 if quick else 4096, repeats=2 if quick else 3, device=device)
+        found = reconstruct.kernels(256 if quick else 4096, repeats=2, device=device)
         rows += [{"device": device} | row for row in found]
     return rows
 
@@ -212,6 +222,9 @@ BENCHES: dict[str, Bench] = {
         reconstruct_rows,
         (Panel("Reconstruction", "seconds", "psnr_db", ("preset", "varied"), ("setting", "iterations"),
                ("family", "device"), higher_is_better=True),),
+    ),
+    "scenes": Bench(
+        "held-out quality of dense training on real scenes, captured views only (needs --data)", scene_rows
     ),
     "geometry": Bench(
         "depth and mesh of the field against exact surfaces of procedural scenes",

@@ -68,7 +68,7 @@ def test_registry_has_every_module_and_name():
     assert modules <= set(BENCHES)
 
 
-@pytest.mark.parametrize("name", ["poses"])
+@pytest.mark.parametrize("name", ["poses", "scenes"])
 def test_a_benchmark_without_its_data_says_so(name, tmp_path):
     with pytest.raises(MissingError, match="--data DIR"):
         BENCHES[name].run(True, None)
