@@ -39,6 +39,7 @@ class Job(BaseModel):
     dataset: str
     config: RunConfig
     store: Path | None = None
+    results: Path | None = None
 
     @property
     def store_path(self) -> Path:
@@ -57,9 +58,14 @@ class Job(BaseModel):
         return f"v{self.config.split}-{self.label}{seed}"
 
     @property
+    def results_path(self) -> Path:
+        """Folder of metrics and pictures; `results` overrides it as `store` does the store."""
+        return self.results or self.out
+
+    @property
     def pictures(self) -> Path:
         """Folder of the run's pictures, videos and exports."""
-        return self.out / self.scene_id / self.run
+        return self.results_path / self.scene_id / self.run
 
     @property
     def stages(self) -> tuple[str, ...]:

@@ -1,8 +1,9 @@
 """`cat3d reprocess`: find what is stale in an output folder, say why and what it will cost, redo only that.
 
 A scene is redone in a clone of its store whose files are hard links (every object of a store is replaced by rename,
-never changed in place), and the clone takes the old store's place when all of its stages are complete. Until then the
-old results stay as they were; a reprocessing that was killed goes on in its clone.
+never changed in place), its metrics and pictures go into a folder beside it, and both take the old ones' place when all
+stages of the scene are complete. Until then the old results stay as they were; a reprocessing that was killed goes on
+where it was.
 """
 
 from __future__ import annotations
@@ -138,16 +139,19 @@ def redo(found: list[Stale], from_stage: str | None = None) -> None:
 
     for stale in found:
         clone = clone_path(stale.store)
+        results = clone.with_name(f"{clone.name}-results")
         fresh = not clone.exists()
         if fresh:
+            shutil.rmtree(results, ignore_errors=True)
             make_clone(stale.store, clone)
-        jobs = [job.model_copy(update={"store": clone}) for job, _ in stale.runs.values()]
+        jobs = [job.model_copy(update={"store": clone, "results": results}) for job, _ in stale.runs.values()]
         if from_stage and fresh:  # a clone that is there already had its records taken back before
             store = SceneStore.open(clone, "r+")
             for job in jobs:
                 store.invalidate(from_stage, job.run)
         if jobs:
             run_jobs(jobs)
+        publish(results, stale.store.parent)
         replace_store(stale.store, clone)
 
 
@@ -168,6 +172,17 @@ def make_clone(store: Path, clone: Path) -> None:
             f"{store} can't be cloned for reprocessing ({error}); put the folder on a disk with hard links."
         ) from None
     part.rename(clone)
+
+
+def publish(results: Path, out: Path) -> None:
+    """Move the files of a finished scene to their places in the output folder; a kill in between is made good by doing
+    it again."""
+    for path in sorted(results.rglob("*")):
+        if path.is_file():
+            target = out / path.relative_to(results)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(path, target)
+    shutil.rmtree(results, ignore_errors=True)
 
 
 def replace_store(store: Path, clone: Path) -> None:

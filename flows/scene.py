@@ -135,7 +135,7 @@ def prepare_run(job: Job, capture: Capture) -> None:
         roles[split[role]] = ROLES[role]
     if "role" not in run or not np.array_equal(run.read("role"), roles):
         run.write("role", roles)
-    run.set_attrs(job=job.model_copy(update={"store": None}).model_dump(mode="json"))
+    run.set_attrs(job=job.model_copy(update={"store": None, "results": None}).model_dump(mode="json"))
 
 
 @contextlib.contextmanager

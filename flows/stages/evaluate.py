@@ -72,7 +72,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
                 progress.advance()
     else:
         decisions.append("This run has no rendered held-out views: there is nothing to compare.")
-    append_rows(job.out / "metrics", METRICS, rows, f"{job.scene_id}.{job.run}")
+    append_rows(job.results_path / "metrics", METRICS, rows, f"{job.scene_id}.{job.run}")
     return Outcome({"views": len(test)}, decisions)
 
 

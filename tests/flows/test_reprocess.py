@@ -263,20 +263,31 @@ def test_old_results_stay_until_the_new_are_complete(root: Path, monkeypatch, pr
     old_rows = read_rows(out / "metrics", METRICS).to_pylist()
     from flows.stages import render
 
-    def fail(*_: object) -> None:
-        raise RuntimeError("stopped midway")
+    execute = render.execute
 
-    monkeypatch.setattr(render, "execute", fail)
+    def fail_in_the_second_run(job, *rest):
+        if job.run == "v6-zipnerf":
+            raise RuntimeError("stopped midway")
+        return execute(job, *rest)
+
+    monkeypatch.setattr(render, "execute", fail_in_the_second_run)
+    pictures = {p: p.read_bytes() for p in out.rglob("*.png")}
     with pytest.raises(RuntimeError, match="midway"):
         redo(find_stale(out, where=where)[0])
     store = SceneStore.open(out / "room.zarr")
     assert np.array_equal(store.captured.read("image"), old_image)
     assert store.record("evaluate", "v3-zipnerf") is not None
     assert read_rows(out / "metrics", METRICS).to_pylist() == old_rows
+    assert all(p.read_bytes() == data for p, data in pictures.items())
     monkeypatch.undo()
-    assert stale_of(out, split="3", where=where) == {"v3-zipnerf": FITTED[1:]}, "it goes on in the clone"
+    assert stale_of(out, where=where) == {"v6-zipnerf": FITTED[1:]}, "it goes on in the clone"
     redo(find_stale(out, where=where)[0])
-    assert not clone_path(out / "room.zarr").exists()
+    assert [p.name for p in out.glob(".*reprocess*")] == []
+    keys = {run: SceneStore.open(out / "room.zarr").record("evaluate", run).key for run in PLAIN_RUNS}
+    rows = [r for r in read_rows(out / "metrics", METRICS).to_pylist() if r["run"] in PLAIN_RUNS]
+    assert all(r["key"] == keys[r["run"]] for r in rows)
+    assert len(rows) == sum(r["run"] in PLAIN_RUNS for r in old_rows)
+    assert any(p.read_bytes() != data for p, data in pictures.items())
     assert (SceneStore.open(out / "room.zarr").captured.read("image", [2]) == 90).all()
     assert stale_of(out, where=where) == {}
 
