@@ -22,6 +22,7 @@ from flows.readers import read_capture
 from flows.report import summary_rows, write_report
 from flows.run_command import make_config
 from flows.scene import ensure_store, execute_stage, prepare_run, writing
+from flows.stages.reconstruct import Checkpoint
 from schemas.layout import LAYOUT, SCENE_STAGES
 from schemas.scene_store import SceneStore
 from schemas.skip import SkipConfig
@@ -107,6 +108,7 @@ def run_row(job: Job) -> dict[str, Any]:
         for step in pending(job, expected_steps(job, capture)):
             if linked(store, job, step):
                 continue
+            Checkpoint(job, step.key).remove()  # a measured stage is done in one go
             started = cpu_seconds()
             execute_stage(job, step)
             note(store, job, step.stage, cpu_seconds() - started)
