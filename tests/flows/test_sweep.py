@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,8 @@ from flows.results import compare
 from flows.sweep import open_jobs, run_sweep, sweep_jobs
 from schemas.config import SceneSource, SweepConfig, merged, parse_config
 from schemas.tables import METRICS, TIMINGS, append_rows, read_rows
+from tests.flows.conftest import ROOT, command, environment
+from tests.flows.sampling.scene import random_model
 
 TRAINER = {
     "iterations": 6, "batch_rays": 64, "samples": [8, 8], "grid_max": [32, 64], "grid_features": [1, 2],
@@ -125,3 +128,33 @@ def test_runs_of_one_scene_do_not_undo_each_other(tmp_path: Path, prefect_url: s
     assert run_sweep(config, tmp_path / "out") == []
     scenes, _ = sweep_jobs(config, tmp_path / "out")
     assert open_jobs(scenes[0]) == []
+
+
+@pytest.mark.slow
+def test_a_sweep_killed_at_any_moment_ends_with_the_results_of_an_undisturbed_one(tmp_path: Path, prefect_url: str):
+    """Two scenes with and without generated views; SIGKILL after 6 to 12 s, then the same command again."""
+    model = random_model(tmp_path / "tiny.safetensors")
+    generated = {"method": "cat3d", "plan": {"views": 8}, "sample": {"checkpoint": str(model), "steps": 2},
+                 "skip": {"covered_path": False}}  # fmt: skip
+    longer = {"reconstruct": {"overrides": TRAINER | {"iterations": 60}}}
+    scenes = [{"source": f"procedural:{family}/2?views=9&width=24&height=20"} for family in ("llff", "dtu")]
+    sweep = {"name": "killed", "scenes": scenes, "splits": ["3", "6"], "base": merged(BASE, longer),
+             "methods": {"zipnerf": {"method": "zipnerf"}, "cat3d": generated}}  # fmt: skip
+    (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(sweep))
+    arguments = {name: command("sweep", str(tmp_path / "sweep.yaml"), "--out", str(tmp_path / name)) for name in "ab"}
+    subprocess.run(arguments["a"], cwd=ROOT, env=environment(), check=True, capture_output=True)
+    kills = 0
+    for seconds in (6, 12, 9, 10, 7, 11):
+        process = subprocess.Popen(arguments["b"], cwd=ROOT, env=environment(), stdout=subprocess.DEVNULL)
+        try:
+            process.wait(seconds)
+            break
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            kills += 1
+    subprocess.run(arguments["b"], cwd=ROOT, env=environment(), check=True, capture_output=True)
+    assert kills >= 1
+    a, b = (read_rows(tmp_path / name / "metrics", METRICS).to_pylist() for name in "ab")
+    assert len(a) == 2 * 2 * 2 * 2, "scenes, splits, methods, held-out views"
+    assert a == b
