@@ -22,10 +22,14 @@ from flows.stages.common import read_cameras, read_images, views_with_role
 from schemas.errors import ConfigError
 from schemas.scene_store import Run, SceneStore
 
-VERSION = 2
+VERSION = 3
 CHECKPOINT_INTERVAL_S = 20.0
 #: `skip.rays`: steps that see as many rays as there are pixels, at least, and the fewest rays of a step.
 PASSES, FEWEST_RAYS = 24, 256
+#: `skip.plateau` with more captured views than this: their pixels tell how well other views are met, so training goes
+#: on for as long as they improve at all. (With few views they only tell how well those are remembered.)
+FEW_VIEWS = 9
+PATIENT: dict[str, Any] = {"plateau_patience": 3, "plateau_every": 50, "plateau_tolerance": 0.01}
 #: CAT3D: LPIPS weight 1 on CO3D and mip-NeRF 360, 0.25 elsewhere.
 STRONG_LPIPS = 4.0
 STRONG_LPIPS_DATASETS = ("co3d", "mip360", "mipnerf360")
@@ -88,13 +92,8 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     run = store.run(job.run)
     config = trainer_config(job)
     views, decisions = training_views(job, store, run)
-    if bool(views.captured.all()):  # as for the baseline: captured views agree with each other
-        config = dataclasses.replace(config, lpips_weight=0.0, low_resolution_iterations=0)
-    if job.config.skip.rays and (most := max(FEWEST_RAYS, len(views.pixels) // PASSES)) < config.batch_rays:
-        decisions.append(
-            f"{most} instead of {config.batch_rays} rays a step: {PASSES} steps see as many as all pixels."
-        )
-        config = dataclasses.replace(config, batch_rays=most)
+    config, told = fitted(job, config, views)
+    decisions += told
     smallest = int(views.size.min())
     if config.patch_size > smallest:
         config = dataclasses.replace(config, patch_size=smallest)
@@ -133,6 +132,25 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     checkpoint.remove()
     rays = (trainer.iteration - resumed) * config.batch_rays
     return Outcome({"views": len(views), "steps": trainer.iteration - resumed, "rays": rays}, decisions)
+
+
+def fitted(job: Job, config: ReconstructConfig, views: Views) -> tuple[ReconstructConfig, list[str]]:
+    """The settings where they depend on what there is to train on, and why; overrides of the run stay."""
+    skip, pixels, captured = job.config.skip, len(views.pixels), int(views.captured.sum())
+    changes: dict[str, Any] = {}
+    decisions = []
+    if captured == len(views):  # as for the baseline: captured views agree with each other
+        changes |= {"lpips_weight": 0.0, "low_resolution_iterations": 0}
+    if skip.plateau and captured > FEW_VIEWS:
+        changes |= PATIENT
+    rays = max(FEWEST_RAYS, pixels // PASSES)
+    if skip.rays and rays < config.batch_rays:
+        changes |= {"batch_rays": rays}
+        decisions.append(
+            f"{rays} instead of {config.batch_rays} rays a step: {PASSES} steps see as many as all pixels."
+        )
+    given = job.config.reconstruct.overrides
+    return dataclasses.replace(config, **{n: v for n, v in changes.items() if n not in given}), decisions
 
 
 def skip_decisions(trainer: Trainer) -> list[str]:

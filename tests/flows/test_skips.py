@@ -10,7 +10,7 @@ import torch
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.diffusion import GuidanceConfig, SamplerConfig, sample
-from cat3d_core.nerf import Trainer, Views
+from cat3d_core.nerf import ReconstructConfig, Trainer, Views
 from cat3d_core.plan import PlanConfig, make_plan
 from flows.images import to_uint8
 from flows.inspect import inspect_store
@@ -20,7 +20,7 @@ from flows.sampling.groups import StoredPlan
 from flows.sampling.model import shared_model
 from flows.stages import sample as sample_stage
 from flows.stages.common import read_cameras, read_images
-from flows.stages.reconstruct import generated_views, read_field, trainer_config
+from flows.stages.reconstruct import fitted, generated_views, read_field, trainer_config
 from flows.stages.sample import group_sampler, network_inputs
 from schemas.config import parse_config
 from schemas.errors import ConfigError
@@ -223,3 +223,24 @@ def test_another_path_does_not_render_the_held_out_views_again(model: Path, tmp_
     test = len(run_of(one).renders("test").read("view"))
     assert [record.work["views"] for record in rendered] == [test + 2, 3]
     assert any(f"Skipped {test} of {test + 3} renders" in d for d in rendered[1].decisions)
+
+
+def test_training_fits_what_there_is_to_train_on(model: Path, tmp_path: Path) -> None:
+    def views(captured: int, generated: int) -> Views:
+        count, side = captured + generated, 32
+        poses = torch.eye(4, dtype=torch.float64).expand(count, 4, 4)
+        cameras = Cameras(torch.eye(3, dtype=torch.float64).expand(count, 3, 3), poses, torch.full((count, 2), side))
+        return Views(cameras, [torch.zeros(side, side, 3, dtype=torch.uint8)] * count, torch.arange(count) < captured)
+
+    def chosen(given: Views, *settings: str) -> ReconstructConfig:
+        one = job(tmp_path, model, "reconstruct.overrides={}", *settings)
+        return fitted(one, trainer_config(one), given)[0]
+
+    few, both, dense = views(3, 0), views(3, 80), views(20, 0)
+    assert chosen(few).batch_rays == 256, "a 24th of 3,072 pixels is less than the least"
+    assert chosen(dense).batch_rays == 20 * 32 * 32 // 24
+    assert chosen(both).batch_rays == chosen(few, "skip=none").batch_rays == 1024
+    assert chosen(few, "reconstruct.overrides={batch_rays: 512}").batch_rays == 512, "what is asked for stays"
+    assert chosen(few).lpips_weight == 0 < chosen(both).lpips_weight
+    assert [chosen(v).plateau_tolerance for v in (few, both, dense)] == [0.1, 0.1, 0.01]
+    assert chosen(dense, "skip=none").plateau_patience == 0
