@@ -25,7 +25,6 @@ from flows.summary import (
     method_times,
     number,
     paper_tables,
-    print_metrics,
     shared_savings,
     split_order,
     summary_rows,
@@ -34,8 +33,6 @@ from flows.summary import (
 from schemas.layout import STAGES
 from schemas.scene_store import Run, SceneStore
 from schemas.tables import TIMINGS, read_rows
-
-__all__ = ["number", "print_metrics", "summary_rows", "timing_rows", "write_report"]
 
 #: Held-out views shown of each run: all of a few, else this many.
 VIEWS_SHOWN = 3

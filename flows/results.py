@@ -8,7 +8,7 @@ from rich.table import Table
 
 from flows.progress import console
 from flows.readers.base import InputError
-from flows.report import number, summary_rows
+from flows.summary import number, summary_rows
 
 #: What counts as worse, per metric: (name, sign of better, unit).
 COMPARED = (("psnr_db", 1, "dB"), ("ssim", 1, ""), ("lpips", -1, ""))

@@ -59,7 +59,8 @@ def run_command(
             from flows.scene import scene_flow
 
             scene_flow(capture.scene_id, [job.model_dump(mode="json") for job in jobs])
-    from flows.report import print_metrics, write_report
+    from flows.report import write_report
+    from flows.summary import print_metrics
 
     report = write_report(out.resolve(), only_if_changed=not any(todo.values()))
     print_metrics(out.resolve(), capture.scene_id)

@@ -19,10 +19,11 @@ import pyarrow.parquet as pq
 
 from flows.jobs import Job, Step, expected_steps, make_jobs, pending
 from flows.readers import read_capture
-from flows.report import summary_rows, write_report
+from flows.report import write_report
 from flows.run_command import make_config
 from flows.scene import ensure_store, execute_stage, prepare_run, writing
 from flows.stages.reconstruct import Checkpoint
+from flows.summary import summary_rows
 from schemas.layout import LAYOUT, SCENE_STAGES
 from schemas.scene_store import SceneStore
 from schemas.skip import SkipConfig
