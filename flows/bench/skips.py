@@ -23,7 +23,7 @@ from flows.report import write_report
 from flows.run_command import make_config
 from flows.scene import ensure_store, execute_stage, prepare_run, writing
 from flows.stages.reconstruct import Checkpoint
-from flows.summary import summary_rows
+from flows.summary import number, summary_rows
 from schemas.layout import LAYOUT, SCENE_STAGES
 from schemas.scene_store import SceneStore
 from schemas.skip import SkipConfig
@@ -215,9 +215,9 @@ def tables(measured: Sequence[dict[str, Any]]) -> str:
         scenes = [row["scene"] for row in members if row["variant"] == "none" and row["scene"] != "mean"]
         lines += [f"Means of {group} ({', '.join(scenes)}):", "", variant, "|---" * 11 + "|"]
         lines += [
-            f"| {r['variant']} | {r['cpu_seconds']:.1f} | {r['speed_up']:.2f}x | {r['sample_seconds']:.1f} | "
-            f"{r['reconstruct_seconds']:.1f} | {r['evaluations']:.0f} | {r['generated']:.0f} | {r['steps']:.0f} | "
-            f"{r['psnr_db']:.2f} | {r['psnr_change_db']:+.2f} | {r['lpips']:.3f} |"
+            f"| {r['variant']} | {r['cpu_seconds']:.1f} | {number(r.get('speed_up'), 2)}x | "
+            f"{r['sample_seconds']:.1f} | {r['reconstruct_seconds']:.1f} | {r['evaluations']:.0f} | {r['generated']:.0f} | {r['steps']:.0f} | "
+            f"{r['psnr_db']:.2f} | {signed(r.get('psnr_change_db'))} | {number(r.get('lpips'), 3)} |"
             for r in members
             if r["scene"] == "mean"
         ]
@@ -230,10 +230,15 @@ def tables(measured: Sequence[dict[str, Any]]) -> str:
             a, b = rows[scene, "none"], rows[scene, "default"]
             lines += [
                 f"| {scene} | {a['cpu_seconds']:.1f} | {b['cpu_seconds']:.1f} | {b['speed_up']:.2f}x | "
-                f"{a['psnr_db']:.2f} | {b['psnr_db']:.2f} | {b['psnr_change_db']:+.2f} | {a['lpips']:.3f} | "
-                f"{b['lpips']:.3f} |"
+                f"{a['psnr_db']:.2f} | {b['psnr_db']:.2f} | {b['psnr_change_db']:+.2f} | {number(a.get('lpips'), 3)} | "
+                f"{number(b.get('lpips'), 3)} |"
             ]
     return "\n".join(lines)
+
+
+def signed(change: float | None) -> str:
+    """A difference for a table; a dash for what was not measured."""
+    return "-" if change is None else f"{change:+.2f}"
 
 
 def write_tables(page: Path, table: Path) -> None:

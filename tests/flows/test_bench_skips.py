@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from flows.bench import skips
+from flows.bench_command import keep
 from schemas.scene_store import SceneStore
 from schemas.skip import SkipConfig
 from tests.flows.sampling.scene import random_model
@@ -60,3 +61,23 @@ def test_variants_share_what_is_equal_and_go_on_where_they_stopped(tmp_path: Pat
     assert by["mean", "none"]["speed_up"] == 1
     assert skips.rows(scenes, ("none", "only plateau", "default"), base, tmp_path / "out") == first
     assert (tmp_path / "out/report.html").exists()
+
+
+def test_the_tables_go_between_the_markers_of_the_page(tmp_path: Path) -> None:
+    counts = {"sample_seconds": 4.0, "reconstruct_seconds": 9.0, "evaluations": 64, "generated": 80, "steps": 500}
+    measured = [
+        {"set": "s", "scene": "a", "variant": v, "seconds": t, "cpu_seconds": t, "psnr_db": p, "lpips": None} | counts
+        for v, t, p in (("none", 40.0, 20.0), ("default", 10.0, 20.25))
+    ]
+    rows = [row | skips.against_none(row, measured) for row in [*measured, *skips.means(measured)]]
+    keep("skips", rows, tmp_path)
+    page = tmp_path / "page.md"
+    page.write_text(f"before\n{skips.START}\nold\n{skips.END}\nafter\n")
+    for _ in range(2):
+        skips.write_tables(page, tmp_path / "skips.parquet")
+    text = page.read_text()
+    assert text.startswith("before\n")
+    assert text.endswith("after\n")
+    assert "old" not in text
+    assert "| default | 10.0 | 4.00x | 4.0 | 9.0 | 64 | 80 | 500 | 20.25 | +0.25 | - |" in text
+    assert "| a | 40.0 | 10.0 | 4.00x | 20.00 | 20.25 | +0.25 | - | - |" in text
