@@ -214,13 +214,12 @@ def tables(measured: Sequence[dict[str, Any]]) -> str:
         members = [row for row in measured if row["set"] == group]
         scenes = [row["scene"] for row in members if row["variant"] == "none" and row["scene"] != "mean"]
         lines += [f"Means of {group} ({', '.join(scenes)}):", "", variant, "|---" * 11 + "|"]
-        lines += [
-            f"| {r['variant']} | {r['cpu_seconds']:.1f} | {number(r.get('speed_up'), 2)}x | "
-            f"{r['sample_seconds']:.1f} | {r['reconstruct_seconds']:.1f} | {r['evaluations']:.0f} | {r['generated']:.0f} | {r['steps']:.0f} | "
-            f"{r['psnr_db']:.2f} | {signed(r.get('psnr_change_db'))} | {number(r.get('lpips'), 3)} |"
-            for r in members
-            if r["scene"] == "mean"
-        ]
+        for r in (r for r in members if r["scene"] == "mean"):
+            cells = [r["variant"], number(r["cpu_seconds"], 1), f"{number(r.get('speed_up'), 2)}x"]
+            cells += [number(r[name], 1) for name in ("sample_seconds", "reconstruct_seconds")]
+            cells += [number(r[name], 0) for name in ("evaluations", "generated", "steps")]
+            cells += [number(r["psnr_db"], 2), signed(r.get("psnr_change_db")), number(r.get("lpips"), 3)]
+            lines.append(f"| {' | '.join(cells)} |")
         lines += [""]
     lines += ["Every scene, `none` and `default`:", ""]
     lines += ["| scene | CPU s | | faster | PSNR dB | | change | LPIPS | |", "|---" * 9 + "|"]
