@@ -1,4 +1,4 @@
-"""Renders along any camera path: a JSON file of poses -> PNG images and an mp4 video."""
+"""Renders along any camera path: a JSON file of poses -> PNG images and mp4 videos."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from cat3d_core.cameras import Cameras
@@ -64,11 +65,25 @@ def read_path(path: Path, width: int, height: int) -> CameraPath:
 
 
 def write_renders(source: Source, path: CameraPath, folder: Path) -> int:
-    """Render a path given in the source's export frame: frame_0000.png, depth_0000.png, ..., path.mp4; how many."""
+    """Render a path given in the source's export frame; the number of frames.
+
+    Of each frame frame_0000.png, depth_0000.png (median), normals_0000.png (along the axes of the path's frame, -1
+    to 1 as black to white) and opacity_0000.png; of the path the videos path.mp4, depth.mp4 and normals.mp4.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     cameras = source.frame_from_scene.inverse().cameras(path.cameras)
+    axes = source.frame_from_scene.rotation.float()
+    depths = []
     for i, render in enumerate(render_views(source, cameras)):
-        write_png(folder / f"frame_{i:04d}.png", render.image)
-        write_png(folder / f"depth_{i:04d}.png", depth_picture(render.depth.numpy()))
-    files = [folder / f"frame_{i:04d}.png" for i in range(len(cameras))]
-    return write_video(folder / "path.mp4", (read_image(file)[0] for file in files), path.fps)
+        depths.append(render.depth.numpy())
+        pictures = {"frame": render.image, "normals": 0.5 + 0.5 * render.normals @ axes.T, "opacity": render.opacity}
+        for kind, picture in pictures.items():
+            write_png(folder / f"{kind}_{i:04d}.png", picture)
+    # One range of depths for the whole path, so that colours do not flicker.
+    near, far = np.quantile(np.stack(depths), [0.01, 0.95])
+    for i, depth in enumerate(depths):
+        write_png(folder / f"depth_{i:04d}.png", depth_picture(depth, float(near), float(far)))
+    for kind, name in (("frame", "path"), ("depth", "depth"), ("normals", "normals")):
+        frames = (read_image(folder / f"{kind}_{i:04d}.png")[0] for i in range(len(depths)))
+        write_video(folder / f"{name}.mp4", frames, path.fps)
+    return len(depths)

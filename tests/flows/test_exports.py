@@ -290,9 +290,16 @@ def test_the_command_writes_everything_in_the_worlds_frame(stored: Path, tmp_pat
     glb: Any = trimesh.load(out / "mesh.glb", force="mesh")
     assert len(ply.faces) == len(glb.faces) > 0
     assert len(open3d.io.read_point_cloud(out / "points.ply").points) > 100
+    kinds = ("frame", "depth", "normals", "opacity")
     assert {p.name for p in (out / "renders").iterdir()} == {
-        "frame_0000.png", "frame_0001.png", "depth_0000.png", "depth_0001.png", "path.mp4"
+        *(f"{kind}_{i:04d}.png" for kind in kinds for i in range(2)), "path.mp4", "depth.mp4", "normals.mp4"
     }  # fmt: skip
+    # Unit normals that face the camera, in the frame of the path.
+    normals = read_image(out / "renders" / "normals_0000.png")[0][..., :3].astype(float) / 127.5 - 1
+    directions = image_rays(truth.cameras, 1).directions.numpy().reshape(normals.shape)
+    inner = np.linalg.norm(normals, axis=-1) > 0.9
+    assert inner.mean() > 0.9
+    assert ((normals * directions).sum(-1)[inner] < 0.02).all()
     # Training views in the data set's own world: exactly the cameras that the reader gave.
     capture = read_capture(out / "dataset")
     train = truth.splits["all"]["train"]
