@@ -55,7 +55,8 @@ class ReconstructConfig:
 
     near_gradient: bool = False
     """Scale gradients of samples at distance t from the camera by min(1, t^2), against floaters in front of cameras
-    (Philip and Deschaintre 2023). The paper states none."""
+    (Philip and Deschaintre 2023). The paper states none, and it depends on the scene: three views, 300 iterations of
+    `fast`, llff_fern 24.8 -> 25.1 dB, re10k_bedroom 21.3 -> 20.5 dB."""
 
     # Trust in generated views
     distance_falloff: float = 15.0
@@ -109,7 +110,8 @@ class ReconstructConfig:
     skip_transmittance: float = 0.0
     """Go along rays from front to back and do not query what less than this share of the light reaches: it adds at
     most that to a colour. In training in the final round only (and in proposals at steps that don't train them, see
-    proposal_every), in renderings in all. 0: all is queried."""
+    proposal_every), in renderings in all. 0: all is queried. Proposals leave little to skip: of a trained `fast` field
+    12 to 17 % of the final intervals lie behind 99 % of the light, and on a CPU the bookkeeping costs as much."""
     skip_groups: int = 4
     """Groups of intervals in which it then goes along."""
     plateau_patience: int = 0
