@@ -153,7 +153,8 @@ _PAPER = ReconstructConfig()
 
 # For two CPU cores and small images: a scene in seconds (tiny), about a minute or two (fast), or over ten (balanced).
 # One proposal round did as well as two at equal cost on fox (27.3 against 26.6 dB) and fern at 3 views (25.4 against
-# 24.9).
+# 24.9). At 200 iterations of a procedural mip360 scene: 27.4 dB in 13.4 CPU seconds; half the samples 26.2 dB in 7.8;
+# three multisamples instead of six 27.3 dB in 10.4.
 _FAST = replace(
     _PAPER,
     batch_rays=1024,
