@@ -51,6 +51,13 @@ def refine(model: MultiViewModel, training: dict[str, Any], work: Path, minutes:
     return {"minutes": minutes, "perceptual": perceptual.name, "renders": scores}
 
 
+def without_folders(value: Any) -> Any:
+    """A document in which absolute paths, which say nothing elsewhere, are replaced by their last name."""
+    if isinstance(value, dict):
+        return {name: without_folders(part) for name, part in value.items()}
+    return Path(value).name if isinstance(value, str) and value.startswith("/") else value
+
+
 def export(work: Path, scenes: int, data: Path | None, refine_minutes: float) -> None:
     """The model of `work` in float16 as the shipped one; evaluated on `scenes` held-out scenes a family (0: not), and
     on the captured scenes in `data`."""
@@ -59,6 +66,7 @@ def export(work: Path, scenes: int, data: Path | None, refine_minutes: float) ->
     if refine_minutes:
         provenance["decoder_refined"] = refine(model, provenance["training"], work, refine_minutes)
         print(provenance["decoder_refined"])
+    provenance = without_folders(provenance)
     digest = save_model(WEIGHTS, model, provenance, torch.float16)
     WEIGHTS.chmod(0o644)
     tables = evaluate_file(WEIGHTS, scenes, pictures=work / "pictures", data=data) if scenes else "Not evaluated yet."

@@ -14,7 +14,7 @@ def test_it_says_what_it_is_and_fits_the_budget():
     path = default_model_path()
     told = describe(path)
     assert len(told["sha256"]) == 64
-    assert {"data", "steps", "groups_of_8_views"} <= set(told["provenance"])
+    assert {"data", "steps", "groups_of_views"} <= set(told["provenance"])
     assert sum(f.stat().st_size for f in path.parent.glob("*.safetensors")) <= 48_000_000
 
 
