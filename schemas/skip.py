@@ -34,11 +34,11 @@ class SkipConfig(StrictModel):
     """Reconstruct, render: queries of the field behind what stops all but a hundredth of a ray's light."""
     proposals: bool = True
     """Reconstruct: training of the proposals at all but every fourth step."""
-    lpips: bool = True
+    lpips: bool = False
     """Reconstruct: the LPIPS loss at all but every fourth step."""
     rays: bool = True
     """Reconstruct: rays of a step beyond a 24th of all pixels, where few views are trained on."""
-    low_resolution: bool = True
+    low_resolution: bool = False
     """Reconstruct: full resolution, and with it the LPIPS loss, in the first eighth of the steps."""
     plateau: bool = True
     """Reconstruct: what is left of the steps when held-out pixels no longer improve, but for a cool-down."""
