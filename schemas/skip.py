@@ -13,7 +13,7 @@ class SkipConfig(StrictModel):
     """Work that a scene may not need, a switch for each; `skip: none` and `skip: all` set all of them.
 
     A switch that is off changes no result. What was skipped, why and what it saved is among the decisions of the
-    stage. The defaults are on the measured front (docs/skips.md).
+    stage. What the defaults save and cost: docs/skips.md.
     """
 
     coverage: bool = True
@@ -30,7 +30,7 @@ class SkipConfig(StrictModel):
     solver: bool = True
     """Sample: steps beyond those a better solver needs for the error of the paper's 50 steps of DDIM. Models whose
     file recommends a sampler are sampled with that one either way."""
-    empty_space: bool = True
+    empty_space: bool = False
     """Reconstruct, render: queries of the field behind what stops all but a hundredth of a ray's light."""
     proposals: bool = True
     """Reconstruct: training of the proposals at all but every fourth step."""
