@@ -164,8 +164,8 @@ _FAST = replace(
     # One small patch a step makes the LPIPS gradient so noisy that the paper's weight drowns the photometric loss:
     # llff_fern, 3 views, 101x76, 300 iterations: 24.7 dB without, 23.4 at 0.02, 18.9 at 0.25.
     lpips_weight=0.02,
-    # The shipped model blurs: 3 photos and 24 generated views of five procedural scenes gave 23.5 dB with half of the rays
-    # from the photos, 22.5 dB with a tenth.
+    # The shipped model blurs: 3 photos and 24 generated views of five procedural scenes gave 23.5 dB with half of the
+    # rays from the photos, 22.5 dB with a tenth.
     captured_share=0.5,
     samples=(32, 16),
     grid_max=(128, 1024),
