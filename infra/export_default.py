@@ -36,7 +36,7 @@ def refine(model: MultiViewModel, training: dict[str, Any], work: Path, minutes:
     """Refine the model's decoder on the bank's renders and the photographs of its training; what was done."""
     perceptual = find_perceptual()
     if perceptual is None:
-        raise SystemExit("--refine needs the weights of a perceptual distance (README, 'Perceptual metrics').")
+        raise SystemExit("--refine needs the weights of a perceptual distance (docs/sweeps.md, 'The tables').")
     bank = training["bank"]
     pictures = rendered_images(Path(bank["folder"] or work), 8192)
     photos = read_photos(Path(bank["textures"])) if bank["textures"] else None
