@@ -20,7 +20,7 @@ import torch
 from cat3d_core.diffusion import MultiViewModel, describe, load_model, save_model
 from cat3d_core.metrics.perceptual import find_perceptual
 from flows.bench.model import evaluate_file
-from flows.training.autoencoder import reconstruction_psnr, refine_decoder
+from flows.training.autoencoder import reconstruction_psnr, train_autoencoder
 from flows.training.prepare import read_photos
 from flows.training.renders import rendered_images
 
@@ -42,7 +42,9 @@ def refine(model: MultiViewModel, training: dict[str, Any], work: Path, minutes:
     photos = read_photos(Path(bank["textures"])) if bank["textures"] else None
     held_out, photos = pictures[-256:].float() / 255, None if photos is None else photos[:-HELD_OUT_PHOTOS]
     before = model.autoencoder
-    model.autoencoder = refine_decoder(before, pictures[:-256], photos, 60 * minutes, perceptual)
+    model.autoencoder = train_autoencoder(
+        before, pictures[:-256], photos, 60 * minutes, learning_rate=1e-3, perceptual=perceptual, decoder_only=True
+    )
     scores = {}
     for name, autoencoder in (("before", before), ("after", model.autoencoder)):
         decoded = autoencoder.decode(autoencoder.encode(held_out[:64]))

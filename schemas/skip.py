@@ -28,8 +28,8 @@ class SkipConfig(StrictModel):
     guidance: bool = True
     """Sample: the unconditional half of the network outside the interval `sample.guidance_log_snr`."""
     solver: bool = True
-    """Sample: steps beyond those a better solver needs for the error of the paper's 50 steps of DDIM. Models whose
-    file recommends a sampler are sampled with that one either way."""
+    """Sample: steps beyond those the model's file recommends or, where it says nothing, a better solver needs for the
+    error of the paper's 50 steps of DDIM."""
     empty_space: bool = False
     """Reconstruct, render: queries of the field behind what stops all but a hundredth of a ray's light."""
     proposals: bool = True

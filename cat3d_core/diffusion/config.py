@@ -17,12 +17,14 @@ Prediction = Literal["v", "eps"]
 @dataclass(frozen=True)
 class AutoencoderConfig:
     """Image <-> latent, 8 times smaller on each side. `widths` are the channels at 1/2, 1/4 and 1/8 size, `blocks` the
-    residual blocks there (the decoder has one more at each size)."""
+    residual blocks there (the decoder has one more at each size). `linear`: a linear transform of 8 x 8 blocks beside
+    both networks, which then only correct it."""
 
     latent_channels: int = 8
     widths: tuple[int, int, int] = (48, 96, 160)
     blocks: tuple[int, int, int] = (1, 2, 2)
     norm_groups: int = 8
+    linear: bool = False
 
 
 @dataclass(frozen=True)

@@ -89,11 +89,15 @@ def device() -> str:
 
 def sampler_settings(job: Job) -> dict[str, Any]:
     """How the job samples: solver, nodes, steps, guidance (the run's own where given, else the model's, else the
-    measured default), the interval of guidance, and whether groups near captured views take fewer steps."""
+    measured default), the interval of guidance, and whether groups near captured views take fewer steps. Without
+    `skip.solver` solver, nodes and steps are the paper's; guidance, which is no skip, stays the model's."""
     settings, skip = job.config.sample, job.config.skip
-    default = SAMPLER_DEFAULT if skip.solver else PAPER_SAMPLER
-    recommended = default | _description(job)["provenance"].get("sampler", {})
-    own = {name: getattr(settings, name) for name in default}
+    advice = _description(job)["provenance"].get("sampler", {})
+    if skip.solver:
+        recommended = SAMPLER_DEFAULT | advice
+    else:
+        recommended = PAPER_SAMPLER | {name: value for name, value in advice.items() if name == "guidance"}
+    own = {name: getattr(settings, name) for name in recommended}
     chosen = {name: recommended[name] if value is None else value for name, value in own.items()}
     limited = skip.guidance and chosen["guidance"] != 1
     interval = settings.guidance_log_snr or GUIDANCE_INTERVAL if limited else (None, None)

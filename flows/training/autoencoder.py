@@ -22,7 +22,6 @@ from cat3d_core.diffusion import (
     save_state,
 )
 from cat3d_core.diffusion.config import from_dict
-from cat3d_core.metrics.perceptual import PerceptualDistance
 from cat3d_core.random import generator
 
 
@@ -59,85 +58,69 @@ def reconstruction_psnr(autoencoder: Autoencoder, images: Tensor) -> float:
 
 
 def train_autoencoder(
-    config: AutoencoderConfig,
+    start: Autoencoder,
     renders: Tensor,
     photos: Tensor | None,
     seconds: float,
-    batch: int,
-    learning_rate: float,
-    seed: int,
-    device: torch.device | str,
-    report: Callable[[float, int, float], None] = lambda passed, step, psnr: None,
+    batch: int = 16,
+    learning_rate: float = 2e-3,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    perceptual: Callable[[Tensor, Tensor], Tensor] | None = None,
+    perceptual_weight: float = 0.1,
+    decoder_only: bool = False,
+    report: Callable[[float, dict[str, float]], None] = lambda passed, numbers: None,
 ) -> Autoencoder:
-    """Train for `seconds`; renders (B, 3, H, W) uint8, photos (M, 3, S, S) in [0, 1] or None.
+    """A copy of `start`, trained for `seconds` (`autoencoder_loss`); the learning rate falls to zero over the time.
 
-    The learning rate falls to zero over the time. `report(share of time passed, step, PSNR of the step in dB)`.
+    renders (B, 3, H, W) uint8, photos (M, 3, S, S) in [0, 1] or None, both on the CPU. `decoder_only`: the encoder and
+    the latents' normalisation stay, so that banks and denoisers keep their meaning.
+    `report(share of time passed, numbers of the step)`.
     """
     torch.manual_seed(seed)
     device = torch.device(device)
-    model = Autoencoder(config).to(device=device)
+    model = copy.deepcopy(start).requires_grad_(not decoder_only).to(device=device)
+    parts = [model.decoder, *([model.synthesis] if model.config.linear else [])]
+    for part in parts:
+        part.requires_grad_(True)
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    optimizer = torch.optim.AdamW(model.parameters(), lr=learning_rate, betas=(0.9, 0.99), weight_decay=1e-3)
-    start, step, passed, record = time.monotonic(), 0, 0.0, {"psnr": 0.0}
+    trained = [p for p in model.parameters() if p.requires_grad]
+    optimizer = torch.optim.AdamW(trained, lr=learning_rate, betas=(0.9, 0.99), weight_decay=1e-3)
+    begun, step, passed = time.monotonic(), 0, 0.0
     while passed < 1:
         random = generator(seed, "autoencoder", step)
         optimizer.param_groups[0]["lr"] = learning_rate * min(1.0, (step + 1) / 60) * (1 - passed) ** 0.8
         images = draw_images(renders, photos, batch, random).to(device)
-        shape = (batch, config.latent_channels, images.shape[-2] // 8, images.shape[-1] // 8)
+        noise = torch.randn(len(images), model.config.latent_channels, images.shape[-2] // 8, images.shape[-1] // 8,
+                            generator=random).to(device) * (not decoder_only)  # fmt: skip
         with torch.autocast(device.type, torch.bfloat16):
-            loss, record = autoencoder_loss(model, images, torch.randn(shape, generator=random).to(device))
+            loss, numbers = autoencoder_loss(
+                model, images, noise, perceptual=perceptual, perceptual_weight=perceptual_weight
+            )
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        torch.nn.utils.clip_grad_norm_(trained, 1.0)
         optimizer.step()
-        step += 1
-        passed = (time.monotonic() - start) / seconds
-        report(min(passed, 1.0), step, record["psnr"])
-    enough = max(16, min(512, 2**23 // renders[0, 0].numel()))  # they pass through the encoder at once
-    model.calibrate(draw_images(renders, photos, enough, generator(seed, "calibration")).to(device))
+        step, passed = step + 1, (time.monotonic() - begun) / seconds
+        report(min(passed, 1.0), numbers)
+    if not decoder_only:
+        model.calibrate(sample_images(renders, photos, generator(seed, "calibration")).to(device))
+    model.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
     return model.cpu().eval().requires_grad_(False)
 
 
-def refine_decoder(
-    autoencoder: Autoencoder,
-    renders: Tensor,
-    photos: Tensor | None,
-    seconds: float,
-    perceptual: PerceptualDistance,
-    weight: float = 0.3,
-    batch: int = 16,
-    learning_rate: float = 1e-3,
-    seed: int = 0,
-    report: Callable[[float, float, float], None] = lambda passed, l1, distance: None,
-) -> Autoencoder:
-    """A copy whose decoder was trained for `seconds` more, on L1 and `weight` times the perceptual distance (Rombach et
-    al. 2022, without the adversary). The encoder stays, so latents, banks and denoisers keep their meaning.
+def new_autoencoder(config: AutoencoderConfig, renders: Tensor, photos: Tensor | None, seed: int) -> Autoencoder:
+    """Where a training from nothing starts: random weights, the linear part from the training's images."""
+    torch.manual_seed(seed)
+    model = Autoencoder(config)
+    if config.linear:
+        model.start_linear(sample_images(renders, photos, generator(seed, "principal components")))
+    return model
 
-    renders and photos as in `train_autoencoder`, on the CPU. `report(share of time passed, L1, distance of the step)`.
-    """
-    model = copy.deepcopy(autoencoder).requires_grad_(False)
-    model.decoder.requires_grad_(True)
-    model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    optimizer = torch.optim.AdamW(model.decoder.parameters(), lr=learning_rate, betas=(0.9, 0.99), weight_decay=1e-3)
-    start, step, passed = time.monotonic(), 0, 0.0
-    while passed < 1:
-        random = generator(seed, "refine", step)
-        optimizer.param_groups[0]["lr"] = learning_rate * min(1.0, (step + 1) / 30) * (1 - passed) ** 0.8
-        images = draw_images(renders, photos, batch, random)
-        with torch.autocast("cpu", torch.bfloat16):
-            with torch.no_grad():
-                raw, _ = model.posterior(images)
-            decoded = model.decode_raw(raw).float()
-        pixels = (decoded - images).abs().mean()
-        distance = perceptual(decoded.clamp(0, 1), images).mean()
-        optimizer.zero_grad(set_to_none=True)
-        (pixels + weight * distance).backward()
-        torch.nn.utils.clip_grad_norm_(model.decoder.parameters(), 1.0)
-        optimizer.step()
-        step, passed = step + 1, (time.monotonic() - start) / seconds
-        report(min(passed, 1.0), pixels.item(), distance.item())
-    model.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
-    return model.eval().requires_grad_(False)
+
+def sample_images(renders: Tensor, photos: Tensor | None, random: torch.Generator) -> Tensor:
+    """As many images of a training, (count, 3, H, W), as may pass through an encoder at once: 16 to 512."""
+    return draw_images(renders, photos, max(16, min(512, 2**23 // renders[0, 0].numel())), random)
 
 
 def save_autoencoder(path: Path, autoencoder: Autoencoder, provenance: dict) -> None:

@@ -16,7 +16,13 @@ from flows.images import read_image
 from flows.progress import console, meter
 from flows.readers.base import InputError
 from flows.training import renders
-from flows.training.autoencoder import load_autoencoder, reconstruction_psnr, save_autoencoder, train_autoencoder
+from flows.training.autoencoder import (
+    load_autoencoder,
+    new_autoencoder,
+    reconstruction_psnr,
+    save_autoencoder,
+    train_autoencoder,
+)
 from flows.training.bank import encode_shards, load_bank
 from flows.training.ranks import Ranks
 from schemas.errors import ConfigError
@@ -99,9 +105,11 @@ def get_autoencoder(
             source = f"trained for {wanted.minutes:g} minutes"
             with meter("train the autoencoder", round(60 * wanted.minutes)) as bar:
                 autoencoder = train_autoencoder(
-                    network.autoencoder, pictures, photos, 60 * wanted.minutes, wanted.batch, wanted.learning_rate,
-                    config.seed, own.device,
-                    lambda passed, step, psnr: bar.update(round(passed * bar.total), f"{psnr:.1f} dB"),
+                    new_autoencoder(network.autoencoder, pictures, photos, config.seed), pictures, photos,
+                    60 * wanted.minutes, wanted.batch, wanted.learning_rate, config.seed, own.device,
+                    report=lambda passed, numbers: bar.update(
+                        round(passed * bar.total), f"{numbers['psnr']:.1f} dB"
+                    ),
                 )  # fmt: skip
         quality = reconstruction_psnr(autoencoder, pictures[-256:].float() / 255)
         save_autoencoder(path, autoencoder, {"source": source, "renders_psnr_db": quality})

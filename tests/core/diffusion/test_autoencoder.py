@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -31,6 +33,33 @@ def test_shapes_and_normalisation():
     torch.testing.assert_close(autoencoder.decode_raw(raw).clamp(0, 1), decoded, rtol=0, atol=1e-5)
     with pytest.raises(ValueError, match="multiples of 8"):
         autoencoder.encode(images[..., :30])
+
+
+def test_the_linear_start_is_the_best_projection_of_blocks():
+    """Against the singular value decomposition in float64: what the components leave over is the least possible."""
+    images = torch.rand(64, 3, 32, 32, generator=torch.Generator().manual_seed(3)).double()
+    images = images * torch.linspace(0.2, 1, 32).double() + 0.3 * images.mean((1, 2, 3), keepdim=True)  # uneven, > 192
+    images = (images / images.max()).clamp(0, 1)
+    blocks = torch.nn.functional.unfold(images * 2 - 1, 8, stride=8).transpose(1, 2).flatten(0, 1)
+    values = torch.linalg.svdvals(blocks - blocks.mean(0))
+    autoencoder = Autoencoder(dataclasses.replace(SIZES["tiny"].autoencoder, linear=True)).double()
+    autoencoder.start_linear(images)
+    latents = autoencoder.posterior(images)[0]
+    with torch.no_grad():
+        decoded = autoencoder.decode_raw(latents)
+    left = ((decoded - images) * 2).square().sum()
+    # `synthesis` has one bias per colour, not per place in a block: the mean block's own shape is all it may lose.
+    mean = blocks.mean(0).reshape(3, 64)
+    shape = (mean - mean.mean(1, keepdim=True)).square().sum() * len(blocks)
+    assert values[8:].square().sum() * 0.999 <= left <= (values[8:].square().sum() + shape) * 1.001
+    variance = latents.detach().var((0, 2, 3))
+    expected = values[:8] / (len(blocks) - 1) ** 0.5  # of std s_i, kept at s_i ** 0.5
+    torch.testing.assert_close(variance, expected, rtol=2e-3, atol=0)
+    autoencoder.calibrate(images)
+    scaled = autoencoder.encode(images).detach()
+    assert scaled.var((0, 2, 3))[0] > scaled.var((0, 2, 3))[-1], "one scale for all channels"
+    with pytest.raises(ValueError, match="too few"):
+        autoencoder.start_linear(images[:2])
 
 
 def test_kl_term_is_the_closed_form():
