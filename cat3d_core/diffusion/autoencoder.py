@@ -1,8 +1,9 @@
 """Image <-> latent: a small convolutional variational autoencoder, 8 times smaller on each side, made for the CPU.
 
 All work is done at half size and below (pixel unshuffle), where the channels are; a few million parameters. With
-`linear` the networks correct a linear transform of 8 x 8 blocks, which `start_linear` sets to the principal components of
-training images: measured, such a start is 1.8 dB ahead of 15 minutes of training from random weights.
+`linear` the networks correct a linear transform of 8 x 8 blocks, which `start_linear` sets to the principal components
+of training images: before any training that gave 29.1 dB on photographs on which 15 minutes of training from random
+weights had given 27.3 dB.
 """
 
 from __future__ import annotations
