@@ -35,7 +35,7 @@ class SkipConfig(StrictModel):
     proposals: bool = True
     """Reconstruct: training of the proposals at all but every fourth step."""
     lpips: bool = False
-    """Reconstruct: the LPIPS loss at all but every fourth step."""
+    """Reconstruct: the LPIPS loss at every second step."""
     rays: bool = True
     """Reconstruct: rays of a step beyond a 24th of all pixels, where few views are trained on."""
     low_resolution: bool = False

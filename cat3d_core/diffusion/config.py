@@ -199,7 +199,7 @@ SIZES: dict[str, ModelConfig] = {
             max_3d_size=64,
             cross_attention_dim=192,
         ),
-        AutoencoderConfig(widths=(32, 64, 128), blocks=(1, 1, 1)),
+        AutoencoderConfig(widths=(32, 64, 128), blocks=(1, 1, 1), linear=True),
         ScheduleConfig(base="cosine"),
     ),
     "paper": ModelConfig(UNetConfig(), AutoencoderConfig(widths=(128, 256, 512), blocks=(2, 2, 2), norm_groups=32)),

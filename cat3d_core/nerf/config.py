@@ -116,6 +116,8 @@ class ReconstructConfig:
     """Groups of intervals in which it then goes along."""
     plateau_patience: int = 0
     """The schedule is cut short once this many checks in a row saw no lower error of held-out pixels; 0: never."""
+    plateau_from: float = 0.0
+    """Share of `iterations` before which no check is made."""
     plateau_every: int = 50
     plateau_pixels: int = 1024
     """Pixels of captured views that are then not trained on, drawn once; checked every plateau_every steps."""
@@ -141,8 +143,8 @@ class ReconstructConfig:
             raise ValueError("proposal_every, lpips_every, plateau_every and skip_groups are at least 1.")
         if not all(0.0 <= x < 1.0 for x in (self.skip_transmittance, self.plateau_tolerance)):
             raise ValueError("skip_transmittance and plateau_tolerance lie in [0, 1).")
-        if not 0.0 <= self.plateau_cooldown <= 1.0:
-            raise ValueError("plateau_cooldown lies in [0, 1].")
+        if not (0.0 <= self.plateau_cooldown <= 1.0 and 0.0 <= self.plateau_from <= 1.0):
+            raise ValueError("plateau_cooldown and plateau_from lie in [0, 1].")
 
     @property
     def rounds(self) -> int:

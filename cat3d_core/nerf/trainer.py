@@ -133,7 +133,7 @@ class Trainer:
         else:
             self._skip(views, batches, totals)
         self.iteration += 1
-        settled = self.iteration > max(c.warmup_iterations, c.low_resolution_iterations)
+        settled = self.iteration > max(c.warmup_iterations, c.low_resolution_iterations, c.plateau_from * c.iterations)
         if self._held_out is not None and settled and self.plateau_at < 0 and self.iteration % c.plateau_every == 0:
             self._check_plateau(self._held_out)
         result = {name: float(value) for name, value in totals.items()}

@@ -29,7 +29,10 @@ PASSES, FEWEST_RAYS = 24, 256
 #: `skip.plateau` with more captured views than this: their pixels tell how well other views are met, so training goes
 #: on for as long as they improve at all. (With few views they only tell how well those are remembered.)
 FEW_VIEWS = 9
-PATIENT: dict[str, Any] = {"plateau_patience": 3, "plateau_every": 50, "plateau_tolerance": 0.01}
+PATIENT: dict[str, Any] = {"plateau_patience": 3, "plateau_every": 50, "plateau_tolerance": 0.01, "plateau_from": 0.0}
+#: `skip.plateau` with generated views, which go on to shape what captured views don't show when those are learned
+#: already: no end is looked for before this share of the steps, and the learning rate falls over that one.
+GENERATED: dict[str, Any] = {"plateau_from": 0.4, "plateau_cooldown": 0.2}
 #: CAT3D: LPIPS weight 1 on CO3D and mip-NeRF 360, 0.25 elsewhere.
 STRONG_LPIPS = 4.0
 STRONG_LPIPS_DATASETS = ("co3d", "mip360", "mipnerf360")
@@ -40,7 +43,7 @@ def skip_settings(iterations: int) -> dict[str, dict[str, Any]]:
     return {
         "empty_space": {"skip_transmittance": 0.01},
         "proposals": {"proposal_every": 4},
-        "lpips": {"lpips_every": 4},
+        "lpips": {"lpips_every": 2},
         "low_resolution": {"low_resolution_iterations": iterations // 8},
         "plateau": {"plateau_patience": 2, "plateau_every": 25, "plateau_tolerance": 0.1},
     }
@@ -141,8 +144,9 @@ def fitted(job: Job, config: ReconstructConfig, views: Views) -> tuple[Reconstru
     decisions = []
     if captured == len(views):  # as for the baseline: captured views agree with each other
         changes |= {"lpips_weight": 0.0, "low_resolution_iterations": 0}
-    if skip.plateau and captured > FEW_VIEWS:
-        changes |= PATIENT
+    if skip.plateau:
+        changes |= GENERATED if captured < len(views) else {}
+        changes |= PATIENT if captured > FEW_VIEWS else {}
     rays = max(FEWEST_RAYS, pixels // PASSES)
     if skip.rays and rays < config.batch_rays:
         changes |= {"batch_rays": rays}
@@ -161,7 +165,7 @@ def skip_decisions(trainer: Trainer) -> list[str]:
     if config.proposal_every > 1:
         out.append(f"Proposals were trained at every {config.proposal_every}th step after the warm-up.")
     if config.lpips_every > 1 and trainer.perceptual is not None:
-        out.append(f"The LPIPS loss was taken at every {config.lpips_every}th step.")
+        out.append(f"The LPIPS loss was taken in one of {config.lpips_every} steps.")
     if config.skip_transmittance:
         out.append(f"The field was not asked where less than {config.skip_transmittance:g} of a ray's light is left.")
     if steps < config.iterations:

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from cat3d_core.diffusion import SamplerConfig, Schedule
+from cat3d_core.diffusion import SamplerConfig, Schedule, count_flops
 from cat3d_core.diffusion.sampler import evaluations
 from flows.jobs import Job, Outcome
 from flows.sampling.fan_out import Totals, fan_out
@@ -38,7 +38,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     """
     run = store.run(job.run)
     plan = StoredPlan(store, run, job.config.seed)
-    rounds = Rounds(job, store, plan) if job.config.skip.rounds else OneRound(plan)
+    rounds = Rounds(job, store, plan, sampling_flops(job, plan)) if job.config.skip.rounds else OneRound(plan)
     totals, groups, spared = Totals(), [], set(range(len(plan.groups)))
     for passes in rounds:
         spared -= {g for items in passes for g in items}
@@ -94,6 +94,13 @@ def group_evaluations(job: Job, group: Group, config: SamplerConfig) -> int:
     """Evaluations of the network for a group."""
     model = model_config(job)
     return evaluations(config, Schedule(model.schedule, model.views - len(group.conditions)))
+
+
+def sampling_flops(job: Job, plan: StoredPlan) -> float:
+    """Floating-point operations of sampling all groups."""
+    config = model_config(job)
+    each = count_flops(config.unet, config.views)
+    return each * sum(group_evaluations(job, group, group_sampler(job, plan, group)) for group in plan.groups)
 
 
 def sampler_decisions(job: Job, plan: StoredPlan, groups: Sequence[int]) -> list[str]:

@@ -170,8 +170,11 @@ def test_views_that_an_earlier_run_sampled_are_left_out_when_they_are_no_longer_
     assert list(generated_views(run_of(one))) == []
 
 
-def test_rounds_stop_when_the_held_out_view_no_longer_improves(model: Path, tmp_path: Path) -> None:
+def test_rounds_stop_when_the_held_out_view_no_longer_improves(model: Path, tmp_path: Path, monkeypatch) -> None:
     settings = "skip={rounds: true, covered_path: false, coverage: false}"
+    told = run_stages(job(tmp_path / "cheap", model, settings), *UP_TO_FIELD[:-1])["sample"].decisions
+    assert any(d.startswith("Sampled in one round: all groups cost less than") for d in told)
+    monkeypatch.setattr("flows.sampling.rounds.BRIEF_FLOPS", 0.0)
     one = job(tmp_path, model, settings)
     records = run_stages(one, *UP_TO_FIELD)
     told = [d for d in records["sample"].decisions if "ound" in d]
