@@ -40,7 +40,7 @@ class SkipConfig(StrictModel):
     """Reconstruct: rays of a step beyond a 24th of all pixels, where few views are trained on."""
     low_resolution: bool = False
     """Reconstruct: full resolution, and with it the LPIPS loss, in the first eighth of the steps."""
-    plateau: bool = False
+    plateau: bool = True
     """Reconstruct: what is left of the steps when held-out pixels no longer improve, but for a cool-down."""
     workers: bool = True
     """Sample, decode: worker processes for what this one has done before they would have started."""

@@ -245,5 +245,6 @@ def test_training_fits_what_there_is_to_train_on(model: Path, tmp_path: Path) ->
     assert chosen(both).batch_rays == chosen(few, "skip=none").batch_rays == 1024
     assert chosen(few, "reconstruct.overrides={batch_rays: 512}").batch_rays == 512, "what is asked for stays"
     assert chosen(few).lpips_weight == 0 < chosen(both).lpips_weight
-    assert [chosen(v, "skip.plateau=true").plateau_tolerance for v in (few, both, dense)] == [0.1, 0.1, 0.01]
-    assert chosen(dense).plateau_patience == chosen(few).plateau_patience == 0
+    assert [chosen(v).plateau_tolerance for v in (few, both, dense)] == [0.1, 0.1, 0.01]
+    assert [chosen(v).plateau_from for v in (few, both, dense)] == [0.0, 0.4, 0.0]
+    assert [chosen(v, "skip.plateau=false").plateau_patience for v in (few, both, dense)] == [0, 0, 0]

@@ -145,6 +145,10 @@ def test_a_plateau_cuts_the_schedule_short_and_cools_down() -> None:
     assert trainer.plateau_at == 15
     assert trainer.iteration == 115
     assert rates[-1] == pytest.approx(config.lr_final, rel=0.05)
+    later = Trainer(dataclasses.replace(config, plateau_from=0.05), _views(), seed=0)
+    while later.plateau_at < 0:
+        later.step()
+    assert later.plateau_at == 65  # the second check after the first at 55: none at 50 or before
     noisy = Trainer(dataclasses.replace(config, plateau_tolerance=0.0, iterations=40), _views(), seed=0)
     while not noisy.finished:
         noisy.step()
