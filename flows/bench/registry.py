@@ -193,7 +193,7 @@ def skip_rows(quick: bool, data: Path | None) -> list[Row]:
         rows = skips.rows(scenes, ("none", "default", "all"), skips.QUICK_BASE, skips.FOLDER / "quick")
     else:
         scenes = list(skips.sources(data))
-        rows = skips.rows(scenes, ("none", "default"))
+        rows = skips.rows(scenes, ("none", "default", "all"))
         for family, switches in skips.ALONE.items():
             alone = [(f"{family}, each alone", *scene[1:]) for scene in scenes if f":{family}/" in scene[1]]
             variants = ("none", *(f"only {name}" for name in switches), "default", "all")

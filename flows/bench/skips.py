@@ -41,11 +41,10 @@ BASE = ("method=cat3d", "plan.views=80", "render.path_views=24")
 SHORT_BASE = (*BASE, "reconstruct.overrides={iterations: 500, warmup_iterations: 50}")
 QUICK_BASE = ("method=cat3d", "plan.views=10", "render.path_views=2", "reconstruct.preset=tiny")
 #: What is measured alone, by family: switches that act where the path has a gap, and where captured views cover it.
-#: (`solver` and `guidance` change nothing for the shipped model, whose file says how to sample it; `rays` acts on few
-#: views.)
+#: (`guidance` changes nothing for the shipped model, whose file asks for none; `rays` acts on few views.)
 ALONE = {
-    "dtu": ("coverage", "rounds", "near_steps", "workers", "empty_space", "proposals", "lpips", "low_resolution",
-            "plateau"),
+    "dtu": ("coverage", "rounds", "near_steps", "solver", "workers", "empty_space", "proposals", "lpips",
+            "low_resolution", "plateau"),
     "re10k": ("covered_path",),
 }  # fmt: skip
 SWITCHES = tuple(SkipConfig.model_fields)
