@@ -16,6 +16,8 @@ from cat3d_core.diffusion.config import ModelConfig
 from cat3d_core.diffusion.model import MultiViewModel
 
 FORMAT = "cat3d.multiview.1"
+#: Beginnings of the names of what makes latents out of images: with the same, latents stay what they are.
+ENCODER = ("autoencoder.encoder.", "autoencoder.analysis.", "autoencoder.latent_")
 
 
 def weights_hash(state: dict[str, Tensor]) -> str:
@@ -50,6 +52,7 @@ def save_model(
         "config": model.config.to_json(),
         "provenance": json.dumps(provenance, sort_keys=True),
         "sha256": digest,
+        "encoder_sha256": weights_hash({name: t for name, t in state.items() if name.startswith(ENCODER)}),
     }
     _write(Path(path), state, metadata)
     return digest
@@ -81,7 +84,8 @@ def load_model(
 
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """Configuration, provenance and hash of a model file, without loading its weights."""
+    """Configuration, provenance and hashes of a model file, without loading its weights: `sha256` of all of them,
+    `encoder_sha256` of those that make latents (the former in files from before there was the latter)."""
     metadata, _ = _read(Path(path), weights=False)
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path} is no cat3d model: its format is {metadata.get('format')!r}, expected {FORMAT!r}.")
@@ -89,6 +93,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         "config": json.loads(metadata["config"]),
         "provenance": json.loads(metadata["provenance"]),
         "sha256": metadata["sha256"],
+        "encoder_sha256": metadata.get("encoder_sha256", metadata["sha256"]),
     }
 
 

@@ -46,6 +46,11 @@ def model_hash(job: Job) -> str:
     return str(_description(job)["sha256"])
 
 
+def encoder_hash(job: Job) -> str:
+    """SHA-256 of the weights that make latents: a model whose U-Net alone was trained further needs no new ones."""
+    return str(_description(job)["encoder_sha256"])
+
+
 def _description(job: Job) -> dict[str, Any]:
     path = checkpoint_path(job)
     return _described(path, path.stat().st_mtime_ns)

@@ -13,7 +13,7 @@ from flows.images import resize
 from flows.jobs import Job, Outcome
 from flows.progress import Meter, meter
 from flows.sampling.groups import CAPTURED_LATENTS
-from flows.sampling.model import cpu_threads, device, forget_model, model_config, model_hash, shared_model
+from flows.sampling.model import cpu_threads, device, encoder_hash, forget_model, model_config, shared_model
 from schemas.content_key import content_key
 from schemas.scene_store import SceneStore
 
@@ -23,8 +23,8 @@ PADDING = 128
 
 
 def inputs(job: Job) -> dict[str, Any]:
-    """The model's weights, and which squares are wanted."""
-    return {"model": model_hash(job), "wide": job.config.plan.wide}
+    """The encoder's weights, and which squares are wanted."""
+    return {"model": encoder_hash(job), "wide": job.config.plan.wide}
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:

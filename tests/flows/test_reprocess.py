@@ -179,13 +179,17 @@ def test_a_setting_makes_exactly_its_stages_stale(finished: Path, setting: str) 
 
 
 def test_a_model_with_other_weights_makes_what_used_it_stale(finished: Path, tmp_path: Path) -> None:
-    from cat3d_core.diffusion import SIZES, MultiViewModel, save_model
+    from cat3d_core.diffusion import SIZES, MultiViewModel, load_model, save_model
 
     torch.manual_seed(1)
     save_model(tmp_path / "other.safetensors", MultiViewModel(SIZES["tiny"]), {})
     shutil.copyfile(finished / "model.safetensors", tmp_path / "same.safetensors")
+    further = load_model(finished / "model.safetensors")
+    further.unet.conv_in.weight.add_(0.1)
+    save_model(tmp_path / "further.safetensors", further, {})
     expected = every([], ["encode", *GENERATED])
-    for name, stale in (("other", expected), ("same", {})):
+    trained_on = every([], GENERATED)  # latents of captured views stay what they are
+    for name, stale in (("other", expected), ("same", {}), ("further", trained_on)):
         changes = {"sample": {"checkpoint": str(tmp_path / f"{name}.safetensors")}}
         assert stale_of(finished / "out", changes=changes) == stale
 

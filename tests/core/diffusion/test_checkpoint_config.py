@@ -47,7 +47,13 @@ def test_checkpoint_round_trip(tmp_path, dtype):
         torch.testing.assert_close(loaded.state_dict()[name], value.to(dtype or value.dtype).float(), rtol=0, atol=0)
     about = describe(tmp_path / "m.safetensors")
     assert about["provenance"] == {"data": "none", "steps": 3}
-    assert about["sha256"] == digest
+    assert about["sha256"] == digest != about["encoder_sha256"]
+    model.autoencoder.decoder[0].bias.data.add_(1)
+    save_model(tmp_path / "decoder.safetensors", model, {}, dtype)
+    assert describe(tmp_path / "decoder.safetensors")["encoder_sha256"] == about["encoder_sha256"]
+    model.autoencoder.latent_std.add_(1)
+    save_model(tmp_path / "scale.safetensors", model, {}, dtype)
+    assert describe(tmp_path / "scale.safetensors")["encoder_sha256"] != about["encoder_sha256"]
     if dtype is None:
         assert weights_hash(loaded.state_dict()) == digest
 

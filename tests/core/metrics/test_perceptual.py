@@ -168,6 +168,20 @@ def test_symmetric_batched_and_close_to_float64(name):
         torch.testing.assert_close(half.double(), double, rtol=0.1, atol=1e-3)
 
 
+@pytest.mark.parametrize("name", ["lpips-alex", "lpips-vgg", "st-lpips-alex"])
+def test_one_small_pair_is_the_same_as_among_others(name):
+    """It goes through the network in one batch with its target: another order of the same sums."""
+    torch.manual_seed(0)
+    distance = PerceptualDistance(name).double()
+    one, other = (torch.rand(2, 3, 40, 40, dtype=torch.float64) for _ in range(2))
+    one.requires_grad_(True)
+    together = distance(one, other)
+    (gradient,) = torch.autograd.grad(together.sum(), one)
+    alone = distance(one[:1], other[:1])
+    torch.testing.assert_close(alone, together[:1], rtol=1e-12, atol=0)
+    torch.testing.assert_close(torch.autograd.grad(alone.sum(), one)[0][0], gradient[0], rtol=1e-9, atol=1e-14)
+
+
 def test_only_images_get_gradients():
     distance = PerceptualDistance("lpips-squeeze")
     assert not any(p.requires_grad for p in distance.parameters())
