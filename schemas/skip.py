@@ -37,7 +37,8 @@ class SkipConfig(StrictModel):
     lpips: bool = False
     """Reconstruct: the LPIPS loss at every second step."""
     rays: bool = True
-    """Reconstruct: rays of a step beyond a 24th of all pixels, where few views are trained on."""
+    """Reconstruct: rays of a step beyond a 24th of all pixels, where few views are trained on, and a quarter of them
+    where views are generated."""
     low_resolution: bool = False
     """Reconstruct: full resolution, and with it the LPIPS loss, in the first eighth of the steps."""
     plateau: bool = True

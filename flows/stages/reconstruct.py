@@ -24,8 +24,9 @@ from schemas.scene_store import Run, SceneStore
 
 VERSION = 3
 CHECKPOINT_INTERVAL_S = 20.0
-#: `skip.rays`: steps that see as many rays as there are pixels, at least, and the fewest rays of a step.
-PASSES, FEWEST_RAYS = 24, 256
+#: `skip.rays`: steps that see as many rays as there are pixels, at least, and the fewest rays of a step. With generated
+#: views, whose pixels are many and uncertain, a step does with this share of its rays.
+PASSES, FEWEST_RAYS, GENERATED_SHARE = 24, 256, 0.75
 #: `skip.plateau` with more captured views than this: their pixels tell how well other views are met, so training goes
 #: on for as long as they improve at all. (With few views they only tell how well those are remembered.)
 FEW_VIEWS = 9
@@ -147,12 +148,12 @@ def fitted(job: Job, config: ReconstructConfig, views: Views) -> tuple[Reconstru
     if skip.plateau:
         changes |= GENERATED if captured < len(views) else {}
         changes |= PATIENT if captured > FEW_VIEWS else {}
-    rays = max(FEWEST_RAYS, pixels // PASSES)
+    most = config.batch_rays if captured == len(views) else round(GENERATED_SHARE * config.batch_rays)
+    rays = min(most, max(FEWEST_RAYS, pixels // PASSES))
     if skip.rays and rays < config.batch_rays:
         changes |= {"batch_rays": rays}
-        decisions.append(
-            f"{rays} instead of {config.batch_rays} rays a step: {PASSES} steps see as many as all pixels."
-        )
+        why = f"{PASSES} steps see as many as all pixels" if rays < most else "most pixels are generated"
+        decisions.append(f"{rays} instead of {config.batch_rays} rays a step: {why}.")
     given = job.config.reconstruct.overrides
     return dataclasses.replace(config, **{n: v for n, v in changes.items() if n not in given}), decisions
 
