@@ -85,10 +85,15 @@ def trainer_config(job: Job) -> ReconstructConfig:
 
 
 def inputs(job: Job) -> dict[str, Any]:
-    """The full trainer configuration and the LPIPS network: a changed preset makes old fields stale."""
+    """The full trainer configuration, the LPIPS network, and the rules of `fitted`: a changed preset or rule makes old
+    fields stale."""
     config = trainer_config(job)
     perceptual = perceptual_name() if config.lpips_weight > 0 else None
-    return {"trainer": dataclasses.asdict(config), "perceptual": perceptual, "rays": job.config.skip.rays}
+    rays = [PASSES, FEWEST_RAYS, GENERATED_SHARE] if job.config.skip.rays else False
+    found: dict[str, Any] = {"trainer": dataclasses.asdict(config), "perceptual": perceptual, "rays": rays}
+    if job.config.skip.plateau:
+        found["plateau"] = [FEW_VIEWS, PATIENT, GENERATED]
+    return found
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
