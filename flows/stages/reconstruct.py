@@ -25,8 +25,9 @@ from schemas.scene_store import Run, SceneStore
 VERSION = 3
 CHECKPOINT_INTERVAL_S = 20.0
 #: `skip.rays`: steps that see as many rays as there are pixels, at least, and the fewest rays of a step. With generated
-#: views, whose pixels are many and uncertain, a step does with this share of its rays.
-PASSES, FEWEST_RAYS, GENERATED_SHARE = 24, 256, 0.75
+#: views, whose pixels are many and uncertain, a step does with this share of its rays if all steps together still see
+#: as many as twice the pixels: short trainings need them all (150 steps: up to 1.2 dB).
+PASSES, FEWEST_RAYS, GENERATED_SHARE, LEAST_PASSES = 24, 256, 0.75, 2
 #: `skip.plateau` with more captured views than this: their pixels tell how well other views are met, so training goes
 #: on for as long as they improve at all. (With few views they only tell how well those are remembered.)
 FEW_VIEWS = 9
@@ -89,7 +90,7 @@ def inputs(job: Job) -> dict[str, Any]:
     fields stale."""
     config = trainer_config(job)
     perceptual = perceptual_name() if config.lpips_weight > 0 else None
-    rays = [PASSES, FEWEST_RAYS, GENERATED_SHARE] if job.config.skip.rays else False
+    rays = [PASSES, FEWEST_RAYS, GENERATED_SHARE, LEAST_PASSES] if job.config.skip.rays else False
     found: dict[str, Any] = {"trainer": dataclasses.asdict(config), "perceptual": perceptual, "rays": rays}
     if job.config.skip.plateau:
         found["plateau"] = [FEW_VIEWS, PATIENT, GENERATED]
@@ -153,7 +154,9 @@ def fitted(job: Job, config: ReconstructConfig, views: Views) -> tuple[Reconstru
     if skip.plateau:
         changes |= GENERATED if captured < len(views) else {}
         changes |= PATIENT if captured > FEW_VIEWS else {}
-    most = config.batch_rays if captured == len(views) else round(GENERATED_SHARE * config.batch_rays)
+    most = config.batch_rays
+    if captured < len(views) and config.iterations * GENERATED_SHARE * most >= LEAST_PASSES * pixels:
+        most = round(GENERATED_SHARE * most)
     rays = min(most, max(FEWEST_RAYS, pixels // PASSES))
     if skip.rays and rays < config.batch_rays:
         changes |= {"batch_rays": rays}

@@ -243,6 +243,7 @@ def test_training_fits_what_there_is_to_train_on(model: Path, tmp_path: Path) ->
     assert chosen(few).batch_rays == 256, "a 24th of 3,072 pixels is less than the least"
     assert chosen(dense).batch_rays == 20 * 32 * 32 // 24
     assert chosen(both).batch_rays == 768, "three quarters of 1,024"
+    assert chosen(both, "reconstruct.overrides={iterations: 150}").batch_rays == 1024, "few passes over all pixels"
     assert chosen(both, "skip=none").batch_rays == chosen(few, "skip=none").batch_rays == 1024
     assert chosen(few, "reconstruct.overrides={batch_rays: 512}").batch_rays == 512, "what is asked for stays"
     assert chosen(few).lpips_weight == 0 < chosen(both).lpips_weight
