@@ -36,10 +36,12 @@ def test_a_lost_dask_workers_groups_are_taken_over(scene, expected, cluster, kin
     struck: list[int] = []
 
     def strike() -> None:
-        while not chunk_times(job):
-            time.sleep(0.02)
-        with distributed.Client(cluster.scheduler_address, set_as_default=False) as client:
+        with distributed.Client(cluster.scheduler_address, set_as_default=False) as client:  # before: it takes a while
+            while not chunk_times(job):
+                time.sleep(0.02)
+            deadline = time.monotonic() + 60
             while not (busy := [a for a, batches in client.processing().items() if batches]):
+                assert time.monotonic() < deadline, "the work ended before a worker was struck"
                 time.sleep(0.01)
             struck.append(client.run(os.getpid, workers=busy[:1])[busy[0]])
             os.kill(struck[0], kind)
