@@ -38,7 +38,7 @@ class SkipConfig(StrictModel):
     """Reconstruct: the LPIPS loss at every second step."""
     rays: bool = True
     """Reconstruct: rays of a step beyond a 24th of all pixels, where few views are trained on, and a quarter of them
-    where views are generated."""
+    where views are generated and the training is long."""
     low_resolution: bool = False
     """Reconstruct: full resolution, and with it the LPIPS loss, in the first eighth of the steps."""
     plateau: bool = True

@@ -17,6 +17,9 @@ from torch import Tensor, nn
 from cat3d_core.diffusion.config import AutoencoderConfig
 from cat3d_core.diffusion.layers import Downsample, ResnetBlock, Upsample
 
+#: Beginnings of the names of an Autoencoder's weights that make latents: while they stay, latents keep their meaning.
+ENCODER = ("encoder.", "analysis.", "latent_")
+
 
 class Autoencoder(nn.Module):
     """Images [B, 3, H, W] in [0, 1], H and W multiples of 8 <-> latents [B, C, H/8, W/8] of about unit variance.

@@ -12,12 +12,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from cat3d_core.diffusion.autoencoder import ENCODER
 from cat3d_core.diffusion.config import ModelConfig
 from cat3d_core.diffusion.model import MultiViewModel
 
 FORMAT = "cat3d.multiview.1"
-#: Beginnings of the names of what makes latents out of images: with the same, latents stay what they are.
-ENCODER = ("autoencoder.encoder.", "autoencoder.analysis.", "autoencoder.latent_")
 
 
 def weights_hash(state: dict[str, Tensor]) -> str:
@@ -47,12 +46,13 @@ def save_model(
             f"The weights to be saved in {path} have values that are not finite (in {dtype or 'their dtype'})."
         )
     digest = weights_hash(state)
+    encoder = tuple(f"autoencoder.{name}" for name in ENCODER)
     metadata = {
         "format": FORMAT,
         "config": model.config.to_json(),
         "provenance": json.dumps(provenance, sort_keys=True),
         "sha256": digest,
-        "encoder_sha256": weights_hash({name: t for name, t in state.items() if name.startswith(ENCODER)}),
+        "encoder_sha256": weights_hash({name: t for name, t in state.items() if name.startswith(encoder)}),
     }
     _write(Path(path), state, metadata)
     return digest

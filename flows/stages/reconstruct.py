@@ -146,7 +146,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
 
 def fitted(job: Job, config: ReconstructConfig, views: Views) -> tuple[ReconstructConfig, list[str]]:
     """The settings where they depend on what there is to train on, and why; overrides of the run stay."""
-    skip, pixels, captured = job.config.skip, len(views.pixels), int(views.captured.sum())
+    skip, captured = job.config.skip, int(views.captured.sum())
     changes: dict[str, Any] = {}
     decisions = []
     if captured == len(views):  # as for the baseline: captured views agree with each other
@@ -154,16 +154,23 @@ def fitted(job: Job, config: ReconstructConfig, views: Views) -> tuple[Reconstru
     if skip.plateau:
         changes |= GENERATED if captured < len(views) else {}
         changes |= PATIENT if captured > FEW_VIEWS else {}
-    most = config.batch_rays
-    if captured < len(views) and config.iterations * GENERATED_SHARE * most >= LEAST_PASSES * pixels:
-        most = round(GENERATED_SHARE * most)
-    rays = min(most, max(FEWEST_RAYS, pixels // PASSES))
+    rays, why = enough_rays(config, len(views.pixels), captured < len(views))
     if skip.rays and rays < config.batch_rays:
         changes |= {"batch_rays": rays}
-        why = f"{PASSES} steps see as many as all pixels" if rays < most else "most pixels are generated"
         decisions.append(f"{rays} instead of {config.batch_rays} rays a step: {why}.")
     given = job.config.reconstruct.overrides
     return dataclasses.replace(config, **{n: v for n, v in changes.items() if n not in given}), decisions
+
+
+def enough_rays(config: ReconstructConfig, pixels: int, generated: bool) -> tuple[int, str]:
+    """Rays of a step that are enough for so many pixels, some of them generated or none, and why."""
+    most = config.batch_rays
+    if generated and config.iterations * GENERATED_SHARE * most >= LEAST_PASSES * pixels:
+        most = round(GENERATED_SHARE * most)
+    few = max(FEWEST_RAYS, pixels // PASSES)
+    if few < most:
+        return few, f"{PASSES} steps see as many as all pixels"
+    return most, "most pixels are generated"
 
 
 def skip_decisions(trainer: Trainer) -> list[str]:

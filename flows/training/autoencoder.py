@@ -21,6 +21,7 @@ from cat3d_core.diffusion import (
     load_state,
     save_state,
 )
+from cat3d_core.diffusion.autoencoder import ENCODER
 from cat3d_core.diffusion.config import from_dict
 from cat3d_core.random import generator
 
@@ -79,12 +80,10 @@ def train_autoencoder(
     """
     torch.manual_seed(seed)
     device = torch.device(device)
-    model = copy.deepcopy(start).requires_grad_(not decoder_only).to(device=device)
-    parts = [model.decoder, *([model.synthesis] if model.config.linear else [])]
-    for part in parts:
-        part.requires_grad_(True)
+    model = copy.deepcopy(start).requires_grad_(False).to(device=device)
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    trained = [p for p in model.parameters() if p.requires_grad]
+    trained = [p.requires_grad_(True) for name, p in model.named_parameters()
+               if not (decoder_only and name.startswith(ENCODER))]  # fmt: skip
     optimizer = torch.optim.AdamW(trained, lr=learning_rate, betas=(0.9, 0.99), weight_decay=1e-3)
     begun, step, passed = time.monotonic(), 0, 0.0
     while passed < 1:

@@ -332,7 +332,7 @@ def test_the_recipe_in_short_follows_the_cameras(tmp_path: Path) -> None:
     settings = ["bank.scenes=120", "autoencoder.minutes=0.75", "sample_scenes=12", "log_steps=25", "sample_minutes=60"]
     run("recipe_10_minutes", "--out", tmp_path, "--steps", "700", *[a for s in settings for a in ("--set", s)])
     losses = [row["loss"] for row in read_rows(tmp_path / "training", TRAINING).to_pylist()]
-    assert sum(losses[-4:]) / 4 < 0.8 * losses[0]  # fine channels of the latents stay unknown
+    assert sum(losses[-4:]) / 4 < 0.75 * losses[0]  # fine channels of the latents stay unknown
     samples = read_rows(tmp_path / "samples", SAMPLES).to_pylist()
     assert {one["step"] for one in samples} == {700}
     gain_db = sum(one["psnr_right_db"] - one["psnr_wrong_db"] for one in samples) / len(samples)

@@ -24,14 +24,14 @@ def test_with_decoder_only_the_latents_keep_their_meaning() -> None:
         return (one - other).square().mean((1, 2, 3))
 
     after = train_autoencoder(
-        before, renders, None, 3.0, batch=8, learning_rate=3e-3, perceptual=distance, decoder_only=True,
+        before, renders, None, 6.0, batch=8, learning_rate=1e-2, perceptual=distance, decoder_only=True,
         report=lambda passed, numbers: seen.append(numbers),
     )  # fmt: skip
     images = renders.float() / 255
     assert all(torch.equal(state[name], value) for name, value in before.state_dict().items())
     assert torch.equal(after.encode(images), before.encode(images))
     assert not torch.equal(after.decode(before.encode(images)), before.decode(before.encode(images)))
-    assert sum(n["l1"] for n in seen[-3:]) < 0.95 * sum(n["l1"] for n in seen[:3])
+    assert sum(n["l1"] for n in seen[-3:]) < 0.8 * sum(n["l1"] for n in seen[:3])
     assert seen[0]["perceptual"] > 0
     assert not any(p.requires_grad for p in after.parameters())
 
