@@ -2,7 +2,7 @@
 //
 // Intervals are handled in chunks, a chunk level by level, so that one level's table stays in the cache, and a level in
 // blocks of B intervals times S samples, sample-major: cell, corner rows, trilinear shares and the erf weight of a whole
-// block are computed in loops that vectorise, then its rows are fetched ahead and gathered or scattered.
+// block are computed in loops that vectorise, samples in one cell become one, and the rows are gathered or scattered.
 // Backward recomputes the corners and lets one thread own a level: no atomics, and the same sum order on every run.
 #include <algorithm>
 #include <cmath>
@@ -18,6 +18,9 @@ constexpr int MAX_S = 6;    // samples per interval
 constexpr int P = B * MAX_S;
 constexpr int CHUNK = 128;  // blocks per chunk
 
+typedef float Reals __attribute__((vector_size(4 * B)));  // a number of each of a block's intervals
+typedef int32_t Integers __attribute__((vector_size(4 * B)));
+
 struct Level {
     int64_t start;
     int32_t resolution;
@@ -28,13 +31,14 @@ struct Level {
 struct Block {
     alignas(64) float x[P], y[P], z[P];
     alignas(64) float sharpness[P];  // 1 / (sqrt 8 std): the erf weight of a level of resolution n is erf(sharpness / n)
-    float least;                     // the smallest sharpness
+    float least;                     // the smallest sharpness; 0 where one is NaN
 };
 
 struct Corners {
     alignas(64) float weight[P];
     alignas(64) float share[8][P];   // trilinear weight times level weight / S; 0 for corners outside a dense level
     alignas(64) uint32_t place[8][P];  // of the corner's first feature in the level's table
+    alignas(64) int32_t kept[B];     // of each interval, the samples that are left after `merge`: a bit each
 };
 
 // F features of a row; rows lie wherever torch put them.
@@ -68,22 +72,27 @@ inline float erf_positive(float x) {
 }
 
 void load(Block& b, const float* positions, const float* std, int64_t first, int count, int samples) {
-    for (int s = 0; s < samples; ++s)
-        for (int i = 0; i < B; ++i) {
-            // The last block repeats its final interval; what is computed for the repeats is never stored.
-            int64_t source = (first + std::min(i, count - 1)) * samples + s;
-            int p = s * B + i;
-            b.x[p] = positions[3 * source];
-            b.y[p] = positions[3 * source + 1];
-            b.z[p] = positions[3 * source + 2];
-            b.sharpness[p] = std[source];
+    for (int i = 0; i < B; ++i) {
+        // The last block repeats its final interval; what is computed for the repeats is never stored.
+        const int64_t source = (first + std::min(i, count - 1)) * samples;
+        for (int s = 0; s < samples; ++s) {
+            b.x[s * B + i] = positions[3 * (source + s)];
+            b.y[s * B + i] = positions[3 * (source + s) + 1];
+            b.z[s * B + i] = positions[3 * (source + s) + 2];
+            b.sharpness[s * B + i] = std[source + s];
         }
-    float least = INFINITY;
-    for (int p = 0; p < samples * B; ++p) {
-        b.sharpness[p] = 1.f / std::max(2.8284271247f * b.sharpness[p], 1e-18f);
-        least = std::min(least, b.sharpness[p] >= 0.f ? b.sharpness[p] : 0.f);  // NaN is not saturated
     }
-    b.least = least;
+    Reals least = Reals{} + INFINITY;
+    Integers nan = {};  // comparisons pass over NaN
+    for (int p = 0; p < samples * B; p += B) {
+        Reals sharpness = *(Reals*)(b.sharpness + p) * 2.8284271247f;
+        sharpness = 1.f / (sharpness < 1e-18f ? Reals{} + 1e-18f : sharpness);
+        *(Reals*)(b.sharpness + p) = sharpness;
+        least = sharpness < least ? sharpness : least;
+        nan |= sharpness != sharpness;
+    }
+    b.least = INFINITY;
+    for (int i = 0; i < B; ++i) b.least = std::min(b.least, nan[i] ? 0.f : least[i]);
 }
 
 template <int F>
@@ -146,6 +155,26 @@ void corners(Corners& c, const Block& b, const Level& level, int samples) {
     }
 }
 
+// Samples of an interval that follow each other in one cell have the same eight rows: the first takes the shares of all.
+// Most do at coarse levels, and at all levels where intervals are short, around surfaces.
+void merge(Corners& c, int samples) {
+    Integers same[MAX_S] = {};  // as the sample before: all bits set
+    for (int s = 1; s < samples; ++s) {
+        same[s] = *(Integers*)(c.place[0] + s * B) == *(Integers*)(c.place[0] + s * B - B);
+        for (int k = 1; k < 8; ++k) same[s] &= *(Integers*)(c.place[k] + s * B) == *(Integers*)(c.place[k] + s * B - B);
+    }
+    for (int k = 0; k < 8; ++k) {
+        Reals sum = *(Reals*)(c.share[k] + (samples - 1) * B);
+        for (int s = samples - 1; s > 0; --s) {
+            sum = *(Reals*)(c.share[k] + (s - 1) * B) + (Reals)((Integers)sum & same[s]);
+            *(Reals*)(c.share[k] + (s - 1) * B) = sum;
+        }
+    }
+    Integers kept = {};
+    for (int s = 0; s < samples; ++s) kept |= ~same[s] & (1 << s);
+    *(Integers*)c.kept = kept;
+}
+
 // Ask for the table's rows ahead, where a level is larger than the innermost cache. Corners that differ in x mostly share
 // a cache line, so every second one will do.
 template <int F, int WRITE>
@@ -155,27 +184,34 @@ void prefetch(const float* table, const Corners& c, int samples) {
             for (int p = 0; p < samples * B; ++p) __builtin_prefetch(table + c.place[k][p], WRITE, 3);
 }
 
+// Calls use(p) for the places in the block of an interval's samples that are left.
+template <typename Use>
+inline void each_kept(const Corners& c, int interval, Use use) {
+    for (uint32_t left = c.kept[interval]; left; left &= left - 1) use(__builtin_ctz(left) * B + interval);
+}
+
 template <int F>
-void gather(float* sum, const Corners& c, const float* table, int samples) {
+void gather(float* sum, const Corners& c, const float* table) {
     typedef typename Features<F>::type V;
-    auto term = [&](int k, int p) { return c.share[k][p] * *(const V*)(table + c.place[k][p]); };
     for (int i = 0; i < B; ++i) {
         V t0 = {}, t1 = {}, t2 = {}, t3 = {};  // four sums: additions need not wait for each other
-        for (int p = i; p < samples * B; p += B) {
-            t0 += term(0, p), t1 += term(1, p), t2 += term(2, p), t3 += term(3, p);
-            t0 += term(4, p), t1 += term(5, p), t2 += term(6, p), t3 += term(7, p);
-        }
+        each_kept(c, i, [&](int p) {
+            auto term = [&](int k) { return c.share[k][p] * *(const V*)(table + c.place[k][p]); };
+            t0 += term(0), t1 += term(1), t2 += term(2), t3 += term(3);
+            t0 += term(4), t1 += term(5), t2 += term(6), t3 += term(7);
+        });
         *(V*)(sum + i * F) = (t0 + t1) + (t2 + t3);
     }
 }
 
 template <int F>
-void scatter(float* table, const Corners& c, const float* gradient, int64_t stride, int count, int samples) {
+void scatter(float* table, const Corners& c, const float* gradient, int64_t stride, int count) {
     typedef typename Features<F>::type V;
     for (int i = 0; i < count; ++i) {
         const V g = *(const V*)(gradient + i * stride);
-        for (int p = i; p < samples * B; p += B)
+        each_kept(c, i, [&](int p) {
             for (int k = 0; k < 8; ++k) *(V*)(table + c.place[k][p]) += c.share[k][p] * g;
+        });
     }
 }
 
@@ -214,8 +250,9 @@ void forward(const float* table, const Samples& in, float* features, float* weig
                     alignas(64) float sum[B * F], weight[B] = {};
                     const float* rows = table + levels[l].start * F;
                     corners<F>(c, b, levels[l], in.samples);
+                    merge(c, in.samples);
                     prefetch<F, 0>(rows, c, in.samples);
-                    gather<F>(sum, c, rows, in.samples);
+                    gather<F>(sum, c, rows);
                     for (int s = 0; s < in.samples; ++s)
                         for (int i = 0; i < B; ++i) weight[i] += c.weight[s * B + i];
                     for (int i = 0; i < count; ++i) {
@@ -254,8 +291,9 @@ void backward(const float* gradient, const Samples& in, float* table_gradient, c
                         for (int f = 0; f < F; ++f) any |= source[i * stride + f] != 0.f;
                     if (!any) return;
                     corners<F>(c, b, levels[l], in.samples);
+                    merge(c, in.samples);
                     prefetch<F, 1>(rows, c, in.samples);
-                    scatter<F>(rows, c, source, stride, count, in.samples);
+                    scatter<F>(rows, c, source, stride, count);
                 });
             }
         }

@@ -20,7 +20,9 @@ def _inputs(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     table = torch.randn((layout.rows, layout.features), generator=generator)
-    positions = torch.rand((count, samples, 3), generator=generator) * 1.04 - 0.02  # also outside the cube
+    centres = torch.rand((count, 1, 3), generator=generator) * 1.04 - 0.02  # also outside the cube
+    lengths = 10 ** (torch.rand((count, 1, 1), generator=generator) * -5)  # samples in many cells, in few and in one
+    positions = centres + (torch.rand((count, samples, 3), generator=generator) - 0.5) * lengths
     std = 10 ** (torch.rand((count, samples), generator=generator) * 5 - 5)
     return table, positions, std
 
