@@ -6,7 +6,14 @@ import torch
 from torch import Tensor
 
 from cat3d_core.nerf import stepfun
-from cat3d_core.nerf.frustums import cone_samples, perpendicular_basis, sample_distances
+from cat3d_core.nerf.frustums import (
+    cone_samples,
+    grid_samples,
+    grid_samples_reference,
+    perpendicular_basis,
+    sample_distances,
+)
+from cat3d_core.rays import Rays
 from cat3d_core.stress.draw import Draw
 from cat3d_core.stress.routine import DOUBLE, ROUNDING, SINGLE, Exact, Routine, zero
 
@@ -167,6 +174,25 @@ def _cone_reference(origin: Tensor, direction: Tensor, radius: Tensor, t: Tensor
     return Exact(value, torch.stack([reach, reach, std], -1).sum(2))
 
 
+def _grid(origin: Tensor, direction: Tensor, radius: Tensor, t: Tensor) -> Tensor:
+    """Per sample: place in the grid's cube and standard deviation there."""
+    positions, std = grid_samples(Rays(origin, direction, radius), t)
+    return torch.cat([positions, std[..., None]], -1)
+
+
+def _grid_reference(origin: Tensor, direction: Tensor, radius: Tensor, t: Tensor) -> Exact:
+    """The torch version in float64; the scales are what rounding of origin + distance along the ray comes to."""
+    rays = Rays(origin, direction, radius)
+    positions, std = grid_samples_reference(rays, t)
+    distance = (cone_samples(*rays, t)[0].norm(dim=-1)).clamp_min(1.0)
+    along = _distances_reference(t).amax(-1, keepdim=True)
+    reach = (
+        origin.norm(dim=-1)[:, None, None] + along * (direction.norm(dim=-1) + radius[:, 0])[:, None, None]
+    ) / distance
+    scale = torch.cat([(0.5 + 0.25 * reach)[..., None].expand_as(positions), (std * (1 + reach))[..., None]], -1)
+    return Exact(torch.cat([positions, std[..., None]], -1), scale)
+
+
 ROUTINES = [
     Routine(
         "stepfun.pdf_from_weights", "0 where a bin has no width", _histogram, stepfun.pdf_from_weights, _pdf_reference,
@@ -203,6 +229,10 @@ ROUTINES = [
     ),
     Routine(
         "frustums.cone_samples", "place and size of the Gaussians", _cone_inputs, _cone, _cone_reference,
+        ROUNDING, floor=1e-30,
+    ),
+    Routine(
+        "frustums.grid_samples", "the kernel of this machine, the same numbers", _cone_inputs, _grid, _grid_reference,
         ROUNDING, floor=1e-30,
     ),
 ]  # fmt: skip

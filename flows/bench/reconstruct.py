@@ -57,14 +57,15 @@ def procedural_views(
 def train_and_measure(
     config: ReconstructConfig, train: Views, test: Views, depths: list[Tensor], device: str = "cpu", seed: int = 0
 ) -> dict[str, float]:
-    """Train once: mean held-out PSNR (dB), absolute relative error of the median depth, seconds, training rays/s."""
+    """Train once: mean held-out PSNR (dB), absolute relative error of the median depth, wall and processor
+    seconds, training rays/s."""
     trainer = Trainer(config, train, seed, device)
-    started = time.perf_counter()
-    while not trainer.finished:
-        trainer.step()
-    if device != "cpu":
-        torch.cuda.synchronize()
-    seconds = time.perf_counter() - started
+
+    def train_all() -> None:
+        while not trainer.finished:
+            trainer.step()
+
+    seconds, cpu_seconds = _timed(train_all, device)
     errors, relative = [], []
     for index in range(len(test)):
         out = render_image(trainer.field, test.cameras, index, config)
@@ -78,6 +79,7 @@ def train_and_measure(
         "psnr_db": sum(errors) / len(errors),
         "depth_abs_rel": sum(relative) / len(relative),
         "seconds": seconds,
+        "cpu_seconds": cpu_seconds,
         "iterations": float(trainer.iteration),
         "rays_per_s": trainer.iteration * config.batch_rays / seconds,
         "skipped": float(trainer.skipped),
@@ -93,16 +95,21 @@ def curves(
     size: int = 64,
     iterations: int | None = None,
     device: str = "cpu",
+    with_preset: bool = True,
 ) -> list[dict[str, Any]]:
-    """PSNR against seconds: the preset, then each setting of `vary` changed alone. One row per run."""
+    """PSNR against seconds: the preset (unless it has been measured), then each setting of `vary` changed alone. One
+    row per run."""
     base = PRESETS[preset]
     if iterations is not None:
         base = dataclasses.replace(base, iterations=iterations, warmup_iterations=iterations // 10)
     rows = []
     for family in families:
         views, held, depths = procedural_views(family, train, test, size, size)
-        for name, change in [("preset", {}), *((key, value) for key in vary for value in VARIATIONS[key])]:
+        alone: list[tuple[str, dict[str, Any]]] = [("preset", {})] if with_preset else []
+        for name, change in [*alone, *((key, value) for key in vary for value in VARIATIONS[key])]:
             config = dataclasses.replace(base, **change)
+            if change and config == base:
+                continue  # the preset itself
             shown = ", ".join(f"{k}={v}" for k, v in change.items())
             common = {"family": family, "preset": preset, "varied": name, "setting": shown, "device": device}
             rows.append(common | train_and_measure(config, views, held, depths, device))

@@ -111,11 +111,9 @@ def reconstruct_rows(quick: bool, data: Path | None) -> list[Row]:
                 rows += reconstruct.curves(preset, vary=(), **size)
             rows += reconstruct.curves(default, vary=("samples",), iterations=100, **size)
         else:
-            size = {"families": ("mip360", "dtu"), "device": device}
-            vary = tuple(reconstruct.VARIATIONS)
-            presets = ["tiny", "fast", "balanced", *(["paper"] if device == "cuda" else [])]
-            for preset in presets:
-                rows += reconstruct.curves(preset, vary=vary if preset == default else (), **size)
+            for preset in ("tiny", "fast", "balanced", *(["paper"] if device == "cuda" else [])):
+                rows += reconstruct.curves(preset, ("mip360", "dtu"), vary=(), device=device)
+            rows += reconstruct.curves(default, ("mip360",), with_preset=False, device=device)
     whole = float(PRESETS[default].iterations)
     return _marked(rows, {"preset": default, "varied": "preset", "iterations": whole})
 
