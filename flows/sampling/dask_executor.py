@@ -30,6 +30,7 @@ os.environ.setdefault("DASK_LOGGING__DISTRIBUTED", "critical")
 logging.getLogger("distributed").setLevel(logging.CRITICAL)
 
 RESTART_TIMEOUT_S = 5
+ANSWER_TIMEOUT_S = 30  # for a line of JSON from the worker that finished; one that stopped since never sends it
 
 
 @task(name="cat3d-batch", task_run_name="{label}", cache_policy=NO_CACHE, persist_result=False)
@@ -123,7 +124,11 @@ def make_cluster(settings: ExecutionConfig) -> Any:
 
 def _answer(number: int, future: distributed.Future) -> Answer:
     if future.status == "finished":
-        return Answer.model_validate_json(future.result())
+        try:
+            return Answer.model_validate_json(future.result(timeout=ANSWER_TIMEOUT_S))
+        except TimeoutError:
+            future.cancel(force=True)
+            return Answer(number=number, died="of the Dask cluster finished a batch and stopped before it could say so")
     error = future.exception() if future.status == "error" else None
     if error is None or isinstance(error, KilledWorker):
         return Answer(number=number, died=f"of the Dask cluster was lost ({error or future.status})")

@@ -12,6 +12,7 @@ import distributed
 import numpy as np
 import pytest
 
+from flows.sampling import dask_executor
 from tests.flows.sampling.scene import chunk_times, run_of, run_stages
 
 
@@ -55,3 +56,20 @@ def test_a_lost_dask_workers_groups_are_taken_over(scene, expected, cluster, kin
     assert np.array_equal(run_of(job).generated.read("latent"), expected["3"])
     if kind == signal.SIGSTOP:
         assert any("finished nothing for" in d for d in record.decisions)
+
+
+def test_an_answer_that_never_comes_is_a_lost_worker(cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dask_executor, "ANSWER_TIMEOUT_S", 0.5)
+    with distributed.Client(cluster.scheduler_address, set_as_default=False) as client:
+        future = client.submit(os.getpid, pure=False)
+        while future.status == "pending":
+            time.sleep(0.01)
+        pid = client.run(os.getpid, workers=list(client.who_has([future])[future.key]))
+        worker = next(iter(pid.values()))
+        os.kill(worker, signal.SIGSTOP)
+        try:
+            answer = dask_executor._answer(3, future)
+        finally:
+            os.kill(worker, signal.SIGCONT)
+    assert (answer.number, answer.error) == (3, "")
+    assert "stopped before it could say so" in answer.died
