@@ -38,7 +38,7 @@ def starting_config(config: ModelConfig, start: Path | None) -> ModelConfig:
         return config
     if _is_ours(start):
         theirs = load_model(start).config
-        # These have no weights: a network may take up relative cameras, or larger images, in the middle of its training.
+        # These have no weights: a network may take up relative cameras or larger images in the middle of its training.
         free = {name: getattr(config.unet, name) for name in ("relative_cameras", "latent_size")}
         if dataclasses.replace(theirs.unet, **free) != config.unet:
             raise ValueError(f"{start} holds another U-Net than the one asked for: {_differences(theirs, config)}.")
