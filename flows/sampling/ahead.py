@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 
 from flows.errors import describe
-from flows.jobs import Job, expected_steps, pending
+from flows.jobs import Job, capture_digests, expected_steps, pending
 from flows.progress import console
 from flows.sampling.fan_out import Totals, fan_out
 from flows.sampling.work import Work
@@ -35,7 +35,7 @@ def sample_ahead(jobs: Sequence[Job]) -> Totals:
             own = [job for job in generative if job.store_path == path]
             with _left_to_its_flow(own[0].scene_id):
                 stores.enter_context(writing(path, own[0].scene_id))
-                works += [work for job in own if (work := prepared(job)) is not None]
+                works += [work for job in with_one_encoding(own) if (work := prepared(job)) is not None]
         if works:
             with _left_to_its_flow(f"{len(works)} runs"):
                 started_at, started = now(), time.monotonic()
@@ -66,6 +66,15 @@ def _left_to_its_flow(what: str) -> Iterator[None]:
         if sentence is None:
             raise
         console.print(f"Sampling {what} together with others failed: {sentence}")
+
+
+def with_one_encoding(jobs: Sequence[Job]) -> list[Job]:
+    """The jobs of a scene whose captured views are encoded as the first's. A scene keeps one encoding at a time: those
+    with another model's encoder sample in their own flow, where they encode right before."""
+    capture = jobs[0].capture()
+    digests = capture_digests(capture)
+    keys = [expected_steps(job, capture, digests)["encode"].key for job in jobs]
+    return [job for job, key in zip(jobs, keys) if key == keys[0]]
 
 
 def prepared(job: Job) -> Work | None:

@@ -23,8 +23,9 @@ PADDING = 128
 
 
 def inputs(job: Job) -> dict[str, Any]:
-    """The encoder's weights, and which squares are wanted."""
-    return {"model": encoder_hash(job), "wide": job.config.plan.wide}
+    """The encoder's weights, and which squares are wanted, how large."""
+    size = model_config(job).image_size
+    return {"model": encoder_hash(job), "image_size": size, "wide": job.config.plan.wide}
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
