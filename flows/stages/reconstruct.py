@@ -16,13 +16,14 @@ from safetensors.torch import save_file
 from cat3d_core.cameras import Cameras
 from cat3d_core.metrics.perceptual import find_perceptual, perceptual_name
 from cat3d_core.nerf import PRESETS, Field, ReconstructConfig, Trainer, Views
+from flows.images import resize
 from flows.jobs import Job, Outcome
 from flows.progress import meter
 from flows.stages.common import read_cameras, read_images, views_with_role
 from schemas.errors import ConfigError
 from schemas.scene_store import Run, SceneStore
 
-VERSION = 3
+VERSION = 4
 CHECKPOINT_INTERVAL_S = 20.0
 #: `skip.rays`: steps that see as many rays as there are pixels, at least, and the fewest rays of a step. With generated
 #: views, whose pixels are many and uncertain, a step does with this share of its rays if all steps together still see
@@ -201,7 +202,10 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[s
     if job.config.method == "zipnerf":
         decisions.append("No views were generated: method zipnerf trains on captured views alone.")
     else:
+        # Detail that no captured view has would be learned at the cost of what they have in common (docs/sweeps.md).
+        finest = float(cameras.intrinsics[:, 0, 0].max())
         for camera, image in generated_views(run):
+            camera, image = no_finer(camera, image, finest)
             cameras = Cameras.cat([cameras, camera])
             images.append(image)
         if len(images) == len(train):
@@ -217,6 +221,15 @@ def generated_views(run: Run) -> Iterator[tuple[Cameras, torch.Tensor]]:
     for i, (view, (x0, y0, width, height)) in enumerate(zip(shown, windows, strict=True)):
         image = run.generated.read("image", [view])[0, y0 : y0 + height, x0 : x0 + width]
         yield cameras[i].crop(x0, y0, width, height), torch.from_numpy(np.ascontiguousarray(image))
+
+
+def no_finer(camera: Cameras, image: torch.Tensor, focal: float) -> tuple[Cameras, torch.Tensor]:
+    """A view (one camera, (h, w, 3) uint8), reduced where its focal length in pixels is longer than `focal`."""
+    scale = focal / float(camera.intrinsics[0, 0, 0])
+    if scale >= 1:
+        return camera, image
+    width, height = (max(1, round(side * scale)) for side in camera.size[0].tolist())
+    return camera.resize(width, height), torch.from_numpy(resize(image.numpy(), width, height))
 
 
 def write_field(run: Run, field: Field, record: list[list[float]]) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from cat3d_core.cameras import Cameras
 from cat3d_core.sample_sets import source_boxes
 from flows.images import read_image
 from flows.jobs import Job, expected_steps, make_jobs, pending
@@ -15,7 +16,7 @@ from flows.readers.base import InputError
 from flows.run_command import make_config
 from flows.sampling.groups import StoredPlan
 from flows.stages.encode import PADDING, square_image
-from flows.stages.reconstruct import generated_views
+from flows.stages.reconstruct import generated_views, no_finer
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
 from schemas.tables import TIMINGS, read_rows
@@ -139,3 +140,14 @@ def test_raymaps_and_conditions_follow_the_world_frame_of_the_store(model: Path,
     first, second = (plan.captured["square"][c] for c in group.conditions[:2])
     moved = first.camera_from_world[0] @ second.world_from_camera[0]
     assert torch.allclose(maps[1, :3, 0, 0], moved[:3, 3].float(), atol=1e-5)
+
+
+def test_generated_views_finer_than_the_photos_are_reduced_to_their_focal_length() -> None:
+    intrinsics = torch.tensor([[[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]])
+    camera = Cameras(intrinsics, torch.eye(4)[None], torch.tensor([[64, 48]]))
+    image = torch.full((48, 64, 3), 90, dtype=torch.uint8)
+    assert no_finer(camera, image, 100.0) == (camera, image)
+    reduced, smaller = no_finer(camera, image, 50.0)
+    assert reduced.size.tolist() == [[32, 24]]
+    torch.testing.assert_close(reduced.intrinsics[0, :2], intrinsics[0, :2] / 2)
+    assert torch.equal(smaller, torch.full((24, 32, 3), 90, dtype=torch.uint8))
