@@ -109,7 +109,7 @@ def wait_for(condition: Callable[[], object], timeout_s: float = 60) -> None:
 def test_the_workers_end_with_their_parent_and_the_next_run_goes_on(scene, expected, kind) -> None:
     job = scene(workers=2, batch_seconds=0.1)  # a group a batch: some are left when the signal comes
     process = start(job)
-    wait_for(lambda: len(chunk_times(job)) >= 1)
+    wait_for(lambda: len(chunk_times(job)) >= 10)
     process.send_signal(kind)
     process.communicate(timeout=30)
     wait_for(lambda parent=process.pid: not workers_of(parent), 5)
