@@ -184,7 +184,7 @@ def _grid_reference(origin: Tensor, direction: Tensor, radius: Tensor, t: Tensor
     """The torch version in float64; the scales are what rounding of origin + distance along the ray comes to."""
     rays = Rays(origin, direction, radius)
     positions, std = grid_samples_reference(rays, t)
-    distance = (cone_samples(*rays, t)[0].norm(dim=-1)).clamp_min(1.0)
+    distance = cone_samples(*rays, t)[0].norm(dim=-1).clamp_min(1.0)
     along = _distances_reference(t).amax(-1, keepdim=True)
     reach = (
         origin.norm(dim=-1)[:, None, None] + along * (direction.norm(dim=-1) + radius[:, 0])[:, None, None]

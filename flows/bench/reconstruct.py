@@ -95,18 +95,15 @@ def curves(
     size: int = 64,
     iterations: int | None = None,
     device: str = "cpu",
-    with_preset: bool = True,
 ) -> list[dict[str, Any]]:
-    """PSNR against seconds: the preset (unless it has been measured), then each setting of `vary` changed alone. One
-    row per run."""
+    """PSNR against seconds: the preset, then each setting of `vary` changed alone. One row per run."""
     base = PRESETS[preset]
     if iterations is not None:
         base = dataclasses.replace(base, iterations=iterations, warmup_iterations=iterations // 10)
     rows = []
     for family in families:
         views, held, depths = procedural_views(family, train, test, size, size)
-        alone: list[tuple[str, dict[str, Any]]] = [("preset", {})] if with_preset else []
-        for name, change in [*alone, *((key, value) for key in vary for value in VARIATIONS[key])]:
+        for name, change in [("preset", {}), *((key, value) for key in vary for value in VARIATIONS[key])]:
             config = dataclasses.replace(base, **change)
             if change and config == base:
                 continue  # the preset itself

@@ -112,8 +112,9 @@ def reconstruct_rows(quick: bool, data: Path | None) -> list[Row]:
             rows += reconstruct.curves(default, vary=("samples",), iterations=100, **size)
         else:
             for preset in ("tiny", "fast", "balanced", *(["paper"] if device == "cuda" else [])):
-                rows += reconstruct.curves(preset, ("mip360", "dtu"), vary=(), device=device)
-            rows += reconstruct.curves(default, ("mip360",), with_preset=False, device=device)
+                rows += reconstruct.curves(preset, ("dtu",), vary=(), device=device)
+                vary = tuple(reconstruct.VARIATIONS) if preset == default else ()
+                rows += reconstruct.curves(preset, ("mip360",), vary, device=device)
     whole = float(PRESETS[default].iterations)
     return _marked(rows, {"preset": default, "varied": "preset", "iterations": whole})
 

@@ -149,9 +149,8 @@ def test_weights_to_start_from(trained: Path) -> None:
     model = load_model(trained / "model.safetensors")
     again = starting_model(model.config, model.autoencoder, trained / "model.safetensors", 0)
     assert all(torch.equal(t, again.unet.state_dict()[n]) for n, t in model.unet.state_dict().items())
-    larger = model_config(
-        "tiny", model.config.image_size * 2, unet={"ray_octaves": 1}
-    )  # convolutions and attention are of any size
+    # Convolutions and attention are of any size.
+    larger = model_config("tiny", model.config.image_size * 2, unet={"ray_octaves": 1})
     assert starting_config(larger, trained / "model.safetensors") == larger
     starting_model(larger, model.autoencoder, trained / "model.safetensors", 0)
     other = model_config("tiny", 32, unet={"ray_octaves": 2})
