@@ -10,8 +10,9 @@ import time
 from collections.abc import Iterator, Sequence
 
 from flows.errors import describe
-from flows.jobs import Job, capture_digests, expected_steps, pending
+from flows.jobs import Job, Step, capture_digests, expected_steps, pending
 from flows.progress import console
+from flows.readers.base import Capture
 from flows.sampling.fan_out import Totals, fan_out
 from flows.sampling.work import Work
 from flows.scene import ensure_store, execute_stage, prepare_run, write_timing, writing
@@ -35,7 +36,7 @@ def sample_ahead(jobs: Sequence[Job]) -> Totals:
             own = [job for job in generative if job.store_path == path]
             with _left_to_its_flow(own[0].scene_id):
                 stores.enter_context(writing(path, own[0].scene_id))
-                works += [work for job in with_one_encoding(own) if (work := prepared(job)) is not None]
+                works += prepared_scene(own)
         if works:
             with _left_to_its_flow(f"{len(works)} runs"):
                 started_at, started = now(), time.monotonic()
@@ -68,22 +69,21 @@ def _left_to_its_flow(what: str) -> Iterator[None]:
         console.print(f"Sampling {what} together with others failed: {sentence}")
 
 
-def with_one_encoding(jobs: Sequence[Job]) -> list[Job]:
-    """The jobs of a scene whose captured views are encoded as the first's. A scene keeps one encoding at a time: those
-    with another model's encoder sample in their own flow, where they encode right before."""
+def prepared_scene(jobs: Sequence[Job]) -> list[Work]:
+    """What is to be sampled of the jobs of a scene whose captured views are encoded as the first's. A scene keeps one
+    encoding at a time: those with another model's encoder sample in their own flow, where they encode right before."""
     capture = jobs[0].capture()
     digests = capture_digests(capture)
-    keys = [expected_steps(job, capture, digests)["encode"].key for job in jobs]
-    return [job for job, key in zip(jobs, keys) if key == keys[0]]
+    steps = [expected_steps(job, capture, digests) for job in jobs]
+    works = [prepared(job, capture, s) for job, s in zip(jobs, steps) if s["encode"].key == steps[0]["encode"].key]
+    return [work for work in works if work is not None]
 
 
-def prepared(job: Job) -> Work | None:
+def prepared(job: Job, capture: Capture, steps: dict[str, Step]) -> Work | None:
     """The job's groups to sample, after the stages before sampling; None where they are sampled already, or chosen only
     while sampling."""
-    capture = job.capture()
     ensure_store(job, capture)
     prepare_run(job, capture)
-    steps = expected_steps(job, capture)
     for step in pending(job, steps):
         if step.stage in PREPARATION:
             execute_stage(job, step)
