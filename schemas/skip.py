@@ -30,6 +30,8 @@ class SkipConfig(StrictModel):
     solver: bool = True
     """Sample: steps beyond those the model's file recommends or, where it says nothing, a better solver needs for the
     error of the paper's 50 steps of DDIM."""
+    detail: bool = True
+    """Reconstruct: pixels of generated views finer than those of the finest captured view."""
     empty_space: bool = False
     """Reconstruct, render: queries of the field behind what stops all but a hundredth of a ray's light."""
     proposals: bool = True

@@ -46,6 +46,8 @@ class SceneBankConfig(_Model):
     """Folder of photographs (.jpg) to cut textures from, beside the procedural ones."""
     folder: Path | None = None
     """Where scenes, autoencoder and latents are kept; None: with the model. Several trainings may share one."""
+    seed: Annotated[int, Field(ge=0, lt=2**63)] | None = None
+    """What scenes and autoencoder are drawn from; None: the training's. Trainings of several seeds can share one."""
     max_gib: PositiveFloat = 8.0
     """Refuse a bank that takes more disk than this, in GiB (renders and latents)."""
 

@@ -93,6 +93,7 @@ def inputs(job: Job) -> dict[str, Any]:
     perceptual = perceptual_name() if config.lpips_weight > 0 else None
     rays = [PASSES, FEWEST_RAYS, GENERATED_SHARE, LEAST_PASSES] if job.config.skip.rays else False
     found: dict[str, Any] = {"trainer": dataclasses.asdict(config), "perceptual": perceptual, "rays": rays}
+    found["detail"] = job.config.skip.detail
     if job.config.skip.plateau:
         found["plateau"] = [FEW_VIEWS, PATIENT, GENERATED]
     return found
@@ -202,13 +203,21 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[s
     if job.config.method == "zipnerf":
         decisions.append("No views were generated: method zipnerf trains on captured views alone.")
     else:
-        # Detail that no captured view has would be learned at the cost of what they have in common (docs/sweeps.md).
-        finest = float(cameras.intrinsics[:, 0, 0].max())
-        for camera, image in generated_views(run):
-            camera, image = no_finer(camera, image, finest)
-            cameras = Cameras.cat([cameras, camera])
-            images.append(image)
-        if len(images) == len(train):
+        made = list(generated_views(run))
+        if job.config.skip.detail:
+            # It would be learned at the cost of what all views have in common (docs/sweeps.md).
+            finest = float(cameras.intrinsics[:, 0, 0].max())
+            whole, made = made, [no_finer(*view, finest) for view in made]
+            reduced = [(a, b) for (_, a), (_, b) in zip(whole, made, strict=True) if a is not b]
+            if reduced:
+                share = sum(b.numel() for _, b in reduced) / sum(a.numel() for a, _ in reduced)
+                decisions.append(
+                    f"{len(reduced)} of {len(made)} generated views were reduced to {share:.0%} of their pixels: "
+                    "no captured view shows finer detail."
+                )
+        cameras = Cameras.cat([cameras, *(camera for camera, _ in made)])
+        images += [image for _, image in made]
+        if not made:
             decisions.append("Trained on captured views alone, without the LPIPS loss: no view was generated.")
     captured = torch.arange(len(cameras)) < len(train)
     return Views(cameras, images, captured), decisions

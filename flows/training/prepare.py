@@ -35,7 +35,7 @@ def prepare(config: TrainRunConfig, network: ModelConfig, folder: Path, own: Ran
     """Render, get the autoencoder, encode; each is skipped where its result is in `folder`. The ranks share the work.
 
     Raises ConfigError for a bank that is too large, or a folder that holds another one."""
-    bank, size = config.bank, network.image_size
+    bank, size, seed = config.bank, network.image_size, bank_seed(config)
     needed = renders.bank_bytes(bank.scenes, bank.views, size, bank.variants, network.unet.latent_channels)
     if needed > bank.max_gib * 2**30:
         raise ConfigError(
@@ -53,7 +53,7 @@ def prepare(config: TrainRunConfig, network: ModelConfig, folder: Path, own: Ran
     scenes = sum(min(renders.SHARD_SCENES, bank.scenes - n * renders.SHARD_SCENES) for n in mine)
     with meter("render scenes", scenes) as bar:
         renders.render_shards(
-            folder, bank.families, bank.scenes, bank.views, size, config.seed, photos, own.device, mine, bar.advance
+            folder, bank.families, bank.scenes, bank.views, size, seed, photos, own.device, mine, bar.advance
         )
     own.barrier()
     autoencoder = get_autoencoder(config, network, folder, photos, own)
@@ -65,12 +65,17 @@ def prepare(config: TrainRunConfig, network: ModelConfig, folder: Path, own: Ran
     return autoencoder.cpu(), latents
 
 
+def bank_seed(config: TrainRunConfig) -> int:
+    """What a bank's scenes and its autoencoder are drawn from."""
+    return config.seed if config.bank.seed is None else config.bank.seed
+
+
 def _identity(config: TrainRunConfig, network: ModelConfig) -> dict[str, Any]:
     """What the contents of a bank depend on."""
-    bank = config.bank.model_dump(mode="json", exclude={"folder", "max_gib"})
+    bank = config.bank.model_dump(mode="json", exclude={"folder", "seed", "max_gib"})
     network_document = json.loads(network.to_json())["autoencoder"]
     wanted = config.autoencoder.model_dump(mode="json")
-    return {"bank": bank, "image_size": network.image_size, "seed": config.seed, "network": network_document,
+    return {"bank": bank, "image_size": network.image_size, "seed": bank_seed(config), "network": network_document,
             "autoencoder": wanted}  # fmt: skip
 
 
@@ -105,8 +110,8 @@ def get_autoencoder(
             source = f"trained for {wanted.minutes:g} minutes"
             with meter("train the autoencoder", round(60 * wanted.minutes)) as bar:
                 autoencoder = train_autoencoder(
-                    new_autoencoder(network.autoencoder, pictures, photos, config.seed), pictures, photos,
-                    60 * wanted.minutes, wanted.batch, wanted.learning_rate, config.seed, own.device,
+                    new_autoencoder(network.autoencoder, pictures, photos, bank_seed(config)), pictures, photos,
+                    60 * wanted.minutes, wanted.batch, wanted.learning_rate, bank_seed(config), own.device,
                     report=lambda passed, numbers: bar.update(
                         round(passed * bar.total), f"{numbers['psnr']:.1f} dB"
                     ),

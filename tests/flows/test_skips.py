@@ -20,7 +20,7 @@ from flows.sampling.groups import StoredPlan
 from flows.sampling.model import shared_model
 from flows.stages import sample as sample_stage
 from flows.stages.common import read_cameras, read_images
-from flows.stages.reconstruct import fitted, generated_views, no_finer, read_field, trainer_config
+from flows.stages.reconstruct import fitted, generated_views, read_field, trainer_config, training_views
 from flows.stages.sample import group_sampler, network_inputs
 from schemas.config import parse_config
 from schemas.errors import ConfigError
@@ -69,8 +69,8 @@ def test_all_none_and_single_switches() -> None:
 
 def test_a_switch_makes_its_own_stage_stale_and_none_before_it(model: Path, tmp_path: Path) -> None:
     first = {"coverage": "plan", "covered_path": "plan", "rounds": "sample", "near_steps": "sample", "solver": "sample",
-             "guidance": "sample", "workers": None, "empty_space": "reconstruct", "proposals": "reconstruct",
-             "plateau": "reconstruct", "rays": "reconstruct", "lpips": "reconstruct",
+             "guidance": "sample", "workers": None, "detail": "reconstruct",
+             "empty_space": "reconstruct", "proposals": "reconstruct", "plateau": "reconstruct", "rays": "reconstruct", "lpips": "reconstruct",
              "low_resolution": "reconstruct"}  # fmt: skip
     capture = job(tmp_path, model).capture()
 
@@ -111,8 +111,7 @@ def test_without_skips_every_stage_is_the_plain_core_bit_for_bit(model: Path, tm
             assert np.array_equal(run.generated.read("image", group.targets[:1]), to_uint8(decoded))
     finally:
         torch.set_num_threads(threads)
-    finest = float(captured.intrinsics[:, 0, 0].max())
-    made = [no_finer(*view, finest) for view in generated_views(run)]
+    made = list(generated_views(run))
     assert len(made) == VIEWS
     cameras = Cameras.cat([captured, *(camera for camera, _ in made)])
     images = [*read_images(store.captured, train), *(image for _, image in made)]
@@ -227,6 +226,21 @@ def test_another_path_does_not_render_the_held_out_views_again(model: Path, tmp_
     test = len(run_of(one).renders("test").read("view"))
     assert [record.work["views"] for record in rendered] == [test + 2, 3]
     assert any(f"Skipped {test} of {test + 3} renders" in d for d in rendered[1].decisions)
+
+
+def test_generated_views_are_no_finer_than_the_photos_and_it_is_said(model: Path, tmp_path: Path) -> None:
+    one = job(tmp_path, model, "skip=none")
+    run_stages(one, *UP_TO_FIELD[:-1])
+    store = SceneStore.open(one.store_path)
+    whole, told = training_views(one, store, store.run(one.run))
+    assert told == []
+    assert whole.size[3:].tolist() == [[64, 64]] * VIEWS
+    reduced, told = training_views(job(tmp_path, model, "skip={detail: true}"), store, store.run(one.run))
+    assert told[0].startswith(f"{VIEWS} of {VIEWS} generated views were reduced to ")
+    assert len(reduced) == len(whole) == 3 + VIEWS
+    assert torch.equal(reduced.size[:3], whole.size[:3])
+    assert bool((reduced.size[3:] < 64).all())
+    assert len(reduced.pixels) < len(whole.pixels)
 
 
 def test_training_fits_what_there_is_to_train_on(model: Path, tmp_path: Path) -> None:
