@@ -70,7 +70,8 @@ def test_all_none_and_single_switches() -> None:
 def test_a_switch_makes_its_own_stage_stale_and_none_before_it(model: Path, tmp_path: Path) -> None:
     first = {"coverage": "plan", "covered_path": "plan", "rounds": "sample", "near_steps": "sample", "solver": "sample",
              "guidance": "sample", "workers": None, "detail": "reconstruct",
-             "empty_space": "reconstruct", "proposals": "reconstruct", "plateau": "reconstruct", "rays": "reconstruct", "lpips": "reconstruct",
+             "empty_space": "reconstruct", "proposals": "reconstruct", "plateau": "reconstruct",
+             "rays": "reconstruct", "lpips": "reconstruct",
              "low_resolution": "reconstruct"}  # fmt: skip
     capture = job(tmp_path, model).capture()
 

@@ -215,9 +215,7 @@ def test_a_folder_of_another_training_is_refused(trained: Path, config: Path, tm
         train_command(str(config), tmp_path, {}, [bank, "bank.scenes=6"], False)
 
 
-def test_trainings_of_other_seeds_share_a_bank_whose_seed_is_given(
-    trained: Path, config: Path, tmp_path: Path
-) -> None:
+def test_trainings_of_other_seeds_share_a_bank_whose_seed_is_given(trained: Path, config: Path, tmp_path: Path) -> None:
     bank, state = f"bank.folder={trained / 'bank'}", (trained / "bank" / "bank.json").read_text()
     with pytest.raises(ConfigError, match="bank.json belongs to a training with other settings .seed"):
         train_command(str(config), tmp_path, {"steps": 1, "seed": 3}, [bank], False)
