@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -167,7 +167,7 @@ def reprocess(
 ) -> None:
     """Redo what is stale after a change of images, cameras, splits, settings, code or model; nothing else."""
     from flows.reprocess import reprocess_command
-    from flows.run_command import settings_document
+    from schemas.settings import settings_document
 
     problems = reprocess_command(out, split, from_, where or [], settings_document(set_ or []), dry_run)
     for sentence in problems:
@@ -201,6 +201,7 @@ def train(
     start: Annotated[Path | None, typer.Option(help="Weights to start from.")] = None,
     seed: Annotated[int | None, typer.Option(help="All randomness follows from it.")] = None,
     device: Annotated[str | None, typer.Option(help="auto, cpu or cuda.")] = None,
+    bank_only: Annotated[bool, typer.Option("--bank-only", help="Only make what is trained on.")] = False,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="One setting, e.g. --set optimizer.groups=8. May be repeated.")
     ] = None,
@@ -209,8 +210,9 @@ def train(
     from flows.train_command import train_command
 
     path = str(autoencoder) if autoencoder else None
-    given = {"steps": steps, "minutes": minutes, "seed": seed, "device": device, "start": str(start) if start else None}
-    train_command(config, out, given | ({"autoencoder": {"path": path}} if path else {}), set_ or [], list_)
+    given: dict[str, Any] = {"steps": steps, "minutes": minutes, "seed": seed, "device": device}
+    given |= {"start": str(start) if start else None} | ({"autoencoder": {"path": path}} if path else {})
+    train_command(config, out, given, set_ or [], list_, bank_only)
 
 
 @app.command()

@@ -7,10 +7,13 @@ from flows.server import ServerError
 from schemas.errors import ConfigError, StoreError
 
 
+class WorkerError(RuntimeError):
+    """Work that can't be finished: the message says which, and what happened to the workers that tried."""
+
+
 def describe(error: BaseException) -> str | None:
     """The sentence a user sees, or None for a fault of ours, which deserves its traceback."""
     from cat3d_core.nerf import NonFiniteError
-    from flows.sampling.work import WorkerError
 
     if isinstance(error, (InputError, StoreError, ConfigError, ServerError, NonFiniteError, WorkerError)):
         return str(error)

@@ -7,12 +7,11 @@ area, as `Cameras.resize` does, and `undistort` keeps the image size and returns
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import imageio_ffmpeg
 import numpy as np
 import OpenImageIO as oiio
 import torch
@@ -23,6 +22,8 @@ from flows.lens import distorted_pixels, filling_zoom
 from flows.readers.base import InputError
 
 MAX_PIXELS = 100_000_000
+#: sRGB grey around images that are padded to squares: the middle of the range the autoencoder knows.
+PADDING = 128
 EXTENSIONS = frozenset(
     ["jpg", "jpeg", "png", "webp", "tif", "tiff", "bmp", "exr", "hdr", "jp2", "jxl", "ppm", "pgm", "tga", "gif"]
 )
@@ -128,6 +129,17 @@ def resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return _from_planes(out, image.ndim)
 
 
+def square_image(image: np.ndarray, box: Sequence[int], image_size: int) -> np.ndarray:
+    """(image_size, image_size, 3) uint8: the square [x0, y0, side] of the image in its pixels, grey beyond it."""
+    x0, y0, side = box
+    height, width = image.shape[:2]
+    square = np.full((side, side, 3), PADDING, np.uint8)
+    left, top = max(x0, 0), max(y0, 0)
+    part = image[top : min(y0 + side, height), left : min(x0 + side, width)]
+    square[top - y0 : top - y0 + part.shape[0], left - x0 : left - x0 + part.shape[1]] = part
+    return resize(square, image_size, image_size)
+
+
 def undistort(
     image: np.ndarray, intrinsics: Tensor, distortion: Tensor, nearest: bool = False
 ) -> tuple[np.ndarray, Tensor]:
@@ -162,43 +174,6 @@ def write_png(path: Path | str, image: np.ndarray | Tensor) -> None:
 def write_jpeg(path: Path | str, image: np.ndarray | Tensor, quality: int = 93) -> None:
     """As `write_png`, in JPEG (no alpha, 4:4:4)."""
     _write(Path(path), to_uint8(image), {"Compression": f"jpeg:{quality}", "jpeg:subsampling": "4:4:4"})
-
-
-def write_video(path: Path | str, frames: Iterable[np.ndarray | Tensor], fps: float = 30) -> int:
-    """Write frames (H, W, 3), all of one size, as H.264 yuv420p mp4 that browsers play; the number of frames written.
-
-    Odd sizes lose their last row or column (the codec halves the colour planes). Raises InputError for no frames, or
-    for a frame of another size.
-    """
-    path = Path(path)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    writer, first, count = None, None, 0
-    try:
-        for frame in frames:
-            pixels = to_uint8(frame)
-            first = first or pixels.shape
-            if pixels.shape != first:
-                raise InputError(
-                    f"Frame {count} of {path} is {pixels.shape}, the first was {first}; they must be equal."
-                )
-            pixels = pixels[: first[0] // 2 * 2, : first[1] // 2 * 2, :3]
-            if writer is None:
-                writer = imageio_ffmpeg.write_frames(
-                    str(partial), pixels.shape[1::-1], fps=fps, codec="libx264", pix_fmt_out="yuv420p", quality=8,
-                    macro_block_size=2, output_params=["-movflags", "+faststart"], ffmpeg_log_level="error",
-                )  # fmt: skip
-                writer.send(None)
-            writer.send(np.ascontiguousarray(pixels))
-            count += 1
-        if writer is None:
-            raise InputError(f"There are no frames to write into {path}.")
-        writer.close()
-        os.replace(partial, path)
-        return count
-    finally:
-        if writer is not None:
-            writer.close()
-        partial.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from flows.jobs import Job, capture_digests, expected_steps, make_jobs, pending
+from flows.locks import writing
 from flows.plan_drawing import plan_table
 from flows.progress import console
 from flows.run_command import make_config
-from flows.scene import ensure_store, execute_stage, prepare_run, writing
+from flows.scene import ensure_store, execute_stage, prepare_run
 from flows.stages.plan import plan_run
 from schemas.scene_store import SceneStore
 

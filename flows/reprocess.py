@@ -58,7 +58,7 @@ def find_stale(
     """
     from fnmatch import fnmatchcase
 
-    from schemas.config import merged
+    from schemas.settings import merged
 
     if not any(out.glob("*.zarr")):
         raise InputError(f"{out} holds no scene stores; give the --out folder of an earlier run or sweep.")

@@ -7,13 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from flows.jobs import Job, capture_digests, expected_steps, make_jobs, pending
 from flows.progress import console
-from flows.readers.base import InputError
-from schemas.config import RunConfig, load_config, merged, parse_config
-from schemas.errors import ConfigError
+from schemas.config import RunConfig, load_config, parse_config
+from schemas.settings import merged, set_at, settings_document, value_at
 
 #: Where each command-line option lives in the configuration.
 OPTION_FIELDS = {
@@ -91,35 +88,6 @@ def make_config(given: dict[str, Any], config_file: Path | None, settings: Seque
     defaults = RunConfig().model_dump(mode="json")
     for name, value in given.items():
         path = OPTION_FIELDS[name]
-        if config_file is None or value != _get(defaults, path):
-            _set(document, path, value)
+        if config_file is None or value != value_at(defaults, path):
+            set_at(document, path, value)
     return parse_config(merged(document, settings_document(settings)), "the settings")
-
-
-def settings_document(settings: Sequence[str]) -> dict[str, Any]:
-    """--set NAME=VALUE options as nested settings. Raises ConfigError for one that can't be read."""
-    document: dict[str, Any] = {}
-    for text in settings:
-        name, equals, value = text.partition("=")
-        if not equals:
-            raise ConfigError(f"--set {text}: write it as NAME=VALUE, e.g. --set render.path_views=30.")
-        try:
-            parsed = yaml.safe_load(value)
-        except yaml.YAMLError:
-            raise ConfigError(f"--set {text}: the value is not valid YAML.") from None
-        _set(document, tuple(name.split(".")), parsed)
-    return document
-
-
-def _get(document: dict[str, Any], path: tuple[str, ...]) -> Any:
-    for part in path:
-        document = document[part]
-    return document
-
-
-def _set(document: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
-    for part in path[:-1]:
-        document = document.setdefault(part, {})
-        if not isinstance(document, dict):
-            raise InputError(f"--set {'.'.join(path)}: {part} is a value, not a group of settings.")
-    document[path[-1]] = value

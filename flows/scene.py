@@ -5,17 +5,12 @@ Tasks get the job (paths and settings) and the step (the wanted content key); re
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import fcntl
 import importlib
-import os
 import platform
 import resource
 import time
-from collections.abc import Iterator
 from datetime import datetime
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,8 +18,9 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
 from flows.jobs import Job, Step, capture_digests, expected_steps, pending
+from flows.locks import writing
 from flows.progress import console
-from flows.readers.base import Capture, InputError
+from flows.readers.base import Capture
 from flows.versions import provenance
 from schemas.errors import StoreError
 from schemas.layout import ROLES
@@ -136,23 +132,3 @@ def prepare_run(job: Job, capture: Capture) -> None:
     if "role" not in run or not np.array_equal(run.read("role"), roles):
         run.write("role", roles)
     run.set_attrs(job=job.model_copy(update={"store": None, "results": None}).model_dump(mode="json"))
-
-
-@contextlib.contextmanager
-def writing(store_path: Path, scene_id: str) -> Iterator[None]:
-    """Be the only command that writes this store; a kill frees the lock. Raises InputError while another one writes."""
-    store_path.parent.mkdir(parents=True, exist_ok=True)
-    lock = store_path.with_name(f".{scene_id}.lock")
-    with open(lock, "a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            file.seek(0)
-            raise InputError(
-                f"Another cat3d command (process {file.read().strip() or 'unknown'}) is writing {store_path}; "
-                "wait for it, or choose another --out."
-            ) from None
-        file.truncate(0)
-        file.write(str(os.getpid()))
-        file.flush()
-        yield

@@ -11,8 +11,9 @@ from pathlib import Path
 from flows.jobs import Job, capture_digests, expected_steps, make_jobs, pending
 from flows.progress import console
 from flows.readers.base import InputError
-from schemas.config import SceneSource, SweepConfig, merged, parse_config
+from schemas.config import SceneSource, SweepConfig, parse_config
 from schemas.errors import ConfigError
+from schemas.settings import merged
 
 
 def sweep_jobs(config: SweepConfig, out: Path) -> tuple[list[list[Job]], list[str]]:

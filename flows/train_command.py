@@ -12,17 +12,18 @@ from typing import Any
 from rich.table import Table
 
 from cat3d_core.diffusion import count_parameters
+from flows.locks import writing
 from flows.progress import console
 from flows.readers.base import InputError
-from flows.run_command import settings_document
 from flows.training.loop import MODEL, SHEETS, STATE, TABLES, train
 from flows.training.model import history, model_config, starting_config, starting_model
 from flows.training.prepare import claim, prepare
 from flows.training.ranks import Ranks, ranks
 from flows.training.sheets import held_out
 from flows.versions import provenance
-from schemas.config import load_config, merged, parse_config
+from schemas.config import load_config, parse_config
 from schemas.errors import ConfigError
+from schemas.settings import merged, settings_document
 from schemas.tables import read_rows
 from schemas.training import SAMPLES, TRAINING, TrainRunConfig
 
@@ -34,8 +35,10 @@ FREE = {"name", "note", "steps", "minutes", "device"} | {
 }  # fmt: skip
 
 
-def train_command(config: str, out: Path, given: dict[str, Any], settings: Sequence[str], list_presets: bool) -> None:
-    """Do what is not done yet of a training. Raises InputError, ConfigError and others, with a sentence."""
+def train_command(
+    config: str, out: Path, given: dict[str, Any], settings: Sequence[str], list_presets: bool, bank_only: bool = False
+) -> None:
+    """Do what is not done yet of a training, or only of its bank. Raises InputError and ConfigError, in a sentence."""
     if list_presets or not config:
         for path in sorted(PRESETS.glob("*.yaml")):
             preset = load_config(path, TrainRunConfig)
@@ -45,7 +48,7 @@ def train_command(config: str, out: Path, given: dict[str, Any], settings: Seque
     with _sentences(config), ranks(asked.device) as own:
         console.quiet = not own.first
         with _only_one(out, TABLES) if own.first else contextlib.nullcontext():
-            run_training(asked, out, own)
+            run_training(asked, out, own, bank_only)
 
 
 def training_config(config: str, given: dict[str, Any], settings: Sequence[str]) -> TrainRunConfig:
@@ -64,11 +67,11 @@ def training_config(config: str, given: dict[str, Any], settings: Sequence[str])
     return parse_config(merged(document, changes), config, TrainRunConfig)
 
 
-def run_training(config: TrainRunConfig, out: Path, own: Ranks) -> None:
+def run_training(config: TrainRunConfig, out: Path, own: Ranks, bank_only: bool = False) -> None:
     """Prepare what is trained on, train, say what came of it."""
     started = time.monotonic()
     network = starting_config(model_config(**config.model.model_dump()), config.start)
-    if own.first:
+    if own.first and not bank_only:
         document = json.loads(config.model_dump_json())
         claim(out / RECORD, document, set(document) - FREE if (out / STATE).exists() else ())
     own.barrier()
@@ -79,6 +82,8 @@ def run_training(config: TrainRunConfig, out: Path, own: Ranks) -> None:
     folder = config.bank.folder or out
     with _only_one(folder, "bank") if own.first else contextlib.nullcontext():
         autoencoder, bank = prepare(config, network, folder, own)
+    if bank_only:
+        return
     scenes = held_out(config.bank.families, config.sample_scenes, network.image_size, max(8, network.views))
     model = starting_model(network, autoencoder, config.start, config.seed)
     families, textures = ", ".join(config.bank.families), config.bank.textures
@@ -95,8 +100,6 @@ def run_training(config: TrainRunConfig, out: Path, own: Ranks) -> None:
 
 
 def _only_one(folder: Path, what: str) -> contextlib.AbstractContextManager[None]:
-    from flows.scene import writing
-
     return writing(folder / what, what)
 
 

@@ -4,8 +4,8 @@
     python infra/export_default.py WORK --scenes 20             # 20 held-out scenes of each family
 
 `--refine 5` first trains the decoder alone for 5 minutes with the perceptual distance that is on this machine; latents
-stay what they are. `--scenes 0` leaves the evaluation out. Start the next training from the shipped weights:
-`--set start=FILE`.
+stay what they are. `--scenes 0` leaves the evaluation out. `--to FOLDER` leaves file and card there instead. Start the
+next training from the shipped weights: `--start FILE`.
 """
 
 from __future__ import annotations
@@ -60,25 +60,27 @@ def without_folders(value: Any) -> Any:
     return Path(value).name if isinstance(value, str) and value.startswith("/") else value
 
 
-def export(work: Path, scenes: int, data: Path | None, refine_minutes: float) -> None:
+def export(
+    work: Path, scenes: int, data: Path | None, refine_minutes: float, weights: Path = WEIGHTS, card: Path = CARD
+) -> None:
     """The model of `work` in float16 as the shipped one; evaluated on `scenes` held-out scenes a family (0: not), and
-    on the captured scenes in `data`."""
+    on the captured scenes in `data`. Files: `weights`, and the shipped card with its numbers replaced as `card`."""
     source = work / "model.safetensors"
     model, provenance = load_model(source), describe(source)["provenance"] | {"sampler": SAMPLER}
     if refine_minutes:
         provenance["decoder_refined"] = refine(model, provenance["training"], work, refine_minutes)
         print(provenance["decoder_refined"])
     provenance = without_folders(provenance)
-    digest = save_model(WEIGHTS, model, provenance, torch.float16)
-    WEIGHTS.chmod(0o644)
-    tables = evaluate_file(WEIGHTS, scenes, pictures=work / "pictures", data=data) if scenes else "Not evaluated yet."
+    digest = save_model(weights, model, provenance, torch.float16)
+    weights.chmod(0o644)
+    tables = evaluate_file(weights, scenes, pictures=work / "pictures", data=data) if scenes else "Not evaluated yet."
     facts = (
         f"Exported {time.strftime('%Y-%m-%d %H:%M')}; this training: {provenance['groups_of_views']:,} groups of views "
-        f"in {provenance['steps']:,} steps, {provenance['hours']} hours; file {WEIGHTS.stat().st_size / 1e6:.1f} MB; "
+        f"in {provenance['steps']:,} steps, {provenance['hours']} hours; file {weights.stat().st_size / 1e6:.1f} MB; "
         f"SHA-256 of the weights `{digest}`."
     )
     head, _, rest = CARD.read_text().partition(START)
-    CARD.write_text(f"{head}{START}\n{facts}\n\n{tables}\n{END}{rest.partition(END)[2]}")
+    card.write_text(f"{head}{START}\n{facts}\n\n{tables}\n{END}{rest.partition(END)[2]}")
     print(facts)
 
 
@@ -88,9 +90,12 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=20, help="held-out scenes of each family")
     parser.add_argument("--data", type=Path, help="folder with captured scenes to evaluate on too")
     parser.add_argument("--refine", type=float, default=0.0, help="minutes of training the decoder alone first")
+    parser.add_argument("--to", type=Path, help="folder for the file and the card (default: where they are shipped)")
+    parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
-    torch.set_num_threads(1)
-    export(options.work, options.scenes, options.data, options.refine)
+    torch.set_num_threads(options.threads)
+    files = (options.to / WEIGHTS.name, options.to / CARD.name) if options.to else (WEIGHTS, CARD)
+    export(options.work, options.scenes, options.data, options.refine, *files)
 
 
 if __name__ == "__main__":

@@ -214,16 +214,6 @@ class SweepConfig(_Model):
     """Scenes worked on at the same time."""
 
 
-def merged(*documents: dict[str, Any]) -> dict[str, Any]:
-    """Nested settings, later documents over earlier ones."""
-    out: dict[str, Any] = {}
-    for document in documents:
-        for name, value in document.items():
-            both = isinstance(value, dict) and isinstance(out.get(name), dict)
-            out[name] = merged(out[name], value) if both else value
-    return out
-
-
 def load_config(path: str | Path, model: type[BaseModel] = RunConfig) -> Any:
     """The configuration in a YAML or JSON file. Raises ConfigError naming the file and the fields."""
     path = Path(path)

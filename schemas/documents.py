@@ -12,6 +12,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import uuid
 from collections.abc import Mapping
@@ -25,6 +26,8 @@ from schemas.errors import MissingError, StoreError
 
 #: Name of the attribute that holds a document's checksum.
 SEAL = "document_sha256"
+#: What may name a file or a group in a store.
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 #: Entries that a `zarr.json` may have.
 KEYS = {
     "zarr_format",
@@ -40,6 +43,13 @@ KEYS = {
     "storage_transformers",
     "dimension_names",
 }
+
+
+def checked_name(name: str) -> str:
+    """`name` if it can be the name of a file in a store, so that no path leads out of it. Raises StoreError."""
+    if not NAME.fullmatch(name):
+        raise StoreError(f"{name!r} can't be a name in a store: use at most 100 letters, digits, '.', '_' and '-'.")
+    return name
 
 
 def plain(value: Any, where: str = "value") -> Any:

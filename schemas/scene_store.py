@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from schemas import migrations
-from schemas.documents import leftovers, read_metadata
+from schemas.documents import checked_name, leftovers, read_metadata
 from schemas.errors import MissingError, StoreError
 from schemas.layout import FORMAT, SCENE_STAGES, SCHEMA_VERSION, STAGES, check_stage, downstream
-from schemas.section import Section, checked_name, make_tree
+from schemas.section import Section, make_tree
 from schemas.stages import StageRecord, read_record, remove_record, write_record
 
 GROUPS = ("captured", "latents", "runs", "stages")

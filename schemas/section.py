@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 import uuid
 from collections.abc import Mapping, Sequence
@@ -13,11 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas import arrays
-from schemas.documents import discard, plain, read_group, write_group
+from schemas.documents import checked_name, discard, plain, read_group, write_group
 from schemas.errors import MissingError, StoreError
 from schemas.layout import array_spec
-
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
 class Section:
@@ -154,13 +151,6 @@ class Section:
     def _check_writable(self) -> None:
         if not self.writable:
             raise StoreError(f"{self.root} is open for reading only: open it with mode='r+' to write to it.")
-
-
-def checked_name(name: str) -> str:
-    """`name` if it can be the name of a file in a store, so that no path leads out of it. Raises StoreError."""
-    if not NAME.fullmatch(name):
-        raise StoreError(f"{name!r} can't be a name in a store: use at most 100 letters, digits, '.', '_' and '-'.")
-    return name
 
 
 def make_tree(folder: Path, attributes: Mapping[str, Any], groups: Sequence[str] = ()) -> bool:

@@ -16,9 +16,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from schemas.documents import sync_folder
+from schemas.documents import checked_name, sync_folder
 from schemas.errors import StoreError
-from schemas.section import checked_name
 
 #: Entry of a file's metadata that holds the checksum of its rows; files of other programs have none.
 SEAL = b"rows_sha256"

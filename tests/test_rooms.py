@@ -53,6 +53,18 @@ def test_core_imports_with_only_torch_numpy_and_safetensors() -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_training_needs_none_of_the_packages_that_a_borrowed_gpu_lacks() -> None:
+    """What infra/gpu/lease.sh runs there, with the packages it carries (docs/training.md)."""
+    blocked = ["prefect", "zarr", "numcodecs", "open3d", "pycolmap", "imageio_ffmpeg", "fastapi", "jinja2"]
+    modules = ["flows.cli", "flows.errors", "flows.train_command", "flows.bench.model", "flows.bench.reconstruct"]
+    code = (
+        f"import sys, importlib\nfor name in {blocked!r}: sys.modules[name] = None\n"
+        f"for name in {modules!r}: importlib.import_module(name)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_only_test_and_bench_setup_names_the_shared_folder() -> None:
     named = [
         str(path.relative_to(ROOT))

@@ -33,9 +33,8 @@ from cat3d_core.sample_sets import sample_cameras, source_boxes
 from cat3d_core.synthetic import FAMILIES, random_cameras, random_scene, trace
 from cat3d_core.synthetic.dataset import surface_points
 from cat3d_core.synthetic.tracer import Traced
-from flows.images import read_image, write_png
+from flows.images import read_image, square_image, write_png
 from flows.readers.base import InputError, read_capture
-from flows.stages.encode import square_image
 
 CAPTURED = ("llff_fern", "dtu_scan24", "co3d_apple", "re10k_bedroom", "mipnerf360_bonsai", "fox")
 ALL_CAPTURED = "all captured"
@@ -114,15 +113,16 @@ def evaluate_group(
 ) -> dict[str, Tensor]:
     """Images (N - given, 3, H, W) of each method but `warp`, and `truth`; image (N, 3, H, W), the first `given`
     given."""
+    device = next(model.parameters()).device
     targets = list(range(given, len(cameras)))
-    latents = model.autoencoder.encode(image)
+    latents = model.autoencoder.encode(image.to(device))
     h, w = latents.shape[-2:]
-    rays = raymap(cameras, cameras.world_from_camera[0], h, w).float()
-    noise = torch.stack([normal(latents.shape[1:], 0, *key, view, "noise") for view in targets])
+    rays = raymap(cameras, cameras.world_from_camera[0], h, w).float().to(device)
+    noise = torch.stack([normal(latents.shape[1:], 0, *key, view, "noise") for view in targets]).to(device)
     out = sample(model, latents[None, :given], rays[None], noise[None], sampler)[0]
     nearest = image[camera_distance(cameras)[given:, :given].argmin(1)]
-    return {"sample": model.autoencoder.decode(out), "nearest": nearest,
-            "autoencoder": model.autoencoder.decode(latents[given:]), "truth": image[given:]}  # fmt: skip
+    return {"sample": model.autoencoder.decode(out).cpu(), "nearest": nearest,
+            "autoencoder": model.autoencoder.decode(latents[given:]).cpu(), "truth": image[given:]}  # fmt: skip
 
 
 def warped(traced: Traced, cameras: Cameras, given: int) -> Tensor:
@@ -222,7 +222,7 @@ def evaluate_file(
 ) -> str:
     """Markdown tables of PSNR, SSIM and (where weights are found) perceptual distance of a model file."""
     perceptual = find_perceptual()
-    model = load_model(path)
+    model = load_model(path).to("cuda" if torch.cuda.is_available() else "cpu")
     model.unet = model.unet.to(torch.bfloat16)
     result = rows(
         model, scenes, sampler=sampler, perceptual=perceptual, pictures=pictures, captured=captured_scenes(data)

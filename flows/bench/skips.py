@@ -18,10 +18,11 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from flows.jobs import Job, Step, expected_steps, make_jobs, pending
+from flows.locks import writing
 from flows.readers import read_capture
 from flows.report import write_report
 from flows.run_command import make_config
-from flows.scene import ensure_store, execute_stage, prepare_run, writing
+from flows.scene import ensure_store, execute_stage, prepare_run
 from flows.stages.reconstruct import Checkpoint
 from flows.summary import number, summary_rows
 from schemas.layout import LAYOUT, SCENE_STAGES

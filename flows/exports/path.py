@@ -12,10 +12,11 @@ import torch
 
 from cat3d_core.cameras import Cameras
 from flows.exports.source import Source, render_views
-from flows.images import read_image, write_png, write_video
+from flows.images import read_image, write_png
 from flows.pictures import depth_picture
 from flows.readers.base import InputError
 from flows.readers.parsing import load_json, numbers
+from flows.video import write_video
 
 LARGEST_SIDE = 8192
 

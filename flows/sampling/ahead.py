@@ -11,11 +11,12 @@ from collections.abc import Iterator, Sequence
 
 from flows.errors import describe
 from flows.jobs import Job, Step, capture_digests, expected_steps, pending
+from flows.locks import writing
 from flows.progress import console
 from flows.readers.base import Capture
 from flows.sampling.fan_out import Totals, fan_out
 from flows.sampling.work import Work
-from flows.scene import ensure_store, execute_stage, prepare_run, write_timing, writing
+from flows.scene import ensure_store, execute_stage, prepare_run, write_timing
 from flows.stages.sample import sample_work
 from flows.summary import SAMPLED_AHEAD
 from schemas.scene_store import SceneStore

@@ -11,9 +11,10 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from flows.errors import WorkerError
 from flows.progress import Meter, meter
 from flows.sampling.executors import Executor, open_executor
-from flows.sampling.work import Answer, Batch, Work, WorkerError, run_batch
+from flows.sampling.work import Answer, Batch, Work, run_batch
 from schemas.config import ExecutionConfig
 from schemas.scene_store import SceneStore
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from cat3d_core.diffusion import MultiViewModel, SamplerConfig, sample
-from flows.sampling.work import WorkerError
+from flows.errors import WorkerError
 
 
 def sample_at_most(

@@ -13,16 +13,12 @@ from collections.abc import Sequence
 from pydantic import BaseModel, ConfigDict
 
 from cat3d_core.nerf import NonFiniteError
+from flows.errors import WorkerError
 from flows.jobs import Job
 from flows.readers.base import InputError
 from flows.sampling.model import cpu_threads, shared_model
 from schemas.errors import ConfigError, StoreError
 from schemas.scene_store import SceneStore, Section
-
-
-class WorkerError(RuntimeError):
-    """Work that can't be finished: the message says which, and what happened to the workers that tried."""
-
 
 #: Errors that a user can act on keep their type on the way from a worker.
 KNOWN_ERRORS = {e.__name__: e for e in (InputError, ConfigError, StoreError, WorkerError, NonFiniteError)}

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 
 from cat3d_core.sample_sets import KINDS, source_boxes
-from flows.images import resize
+from flows.images import square_image
 from flows.jobs import Job, Outcome
 from flows.progress import Meter, meter
 from flows.sampling.groups import CAPTURED_LATENTS
@@ -18,8 +17,6 @@ from schemas.content_key import content_key
 from schemas.scene_store import SceneStore
 
 VERSION = 1
-#: sRGB grey around images that are padded to squares: the middle of the range the autoencoder knows.
-PADDING = 128
 
 
 def inputs(job: Job) -> dict[str, Any]:
@@ -62,14 +59,3 @@ def encode_views(job: Job, store: SceneStore, key: str, kind: str, views: list[i
             store.latents.mark_done(marker, [keys[view]], [view])
             progress.advance()
     return len(missing)
-
-
-def square_image(image: np.ndarray, box: Sequence[int], image_size: int) -> np.ndarray:
-    """(image_size, image_size, 3) uint8: the square [x0, y0, side] of the image in its pixels, grey beyond it."""
-    x0, y0, side = box
-    height, width = image.shape[:2]
-    square = np.full((side, side, 3), PADDING, np.uint8)
-    left, top = max(x0, 0), max(y0, 0)
-    part = image[top : min(y0 + side, height), left : min(x0 + side, width)]
-    square[top - y0 : top - y0 + part.shape[0], left - x0 : left - x0 + part.shape[1]] = part
-    return resize(square, image_size, image_size)

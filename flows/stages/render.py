@@ -14,6 +14,7 @@ from flows.pictures import depth_picture
 from flows.progress import Meter, meter
 from flows.stages.common import read_cameras, views_with_role, write_cameras
 from flows.stages.reconstruct import read_field
+from flows.video import write_video
 from schemas.content_key import array_digest, content_key
 from schemas.scene_store import Run, SceneStore, Section
 
@@ -107,10 +108,10 @@ def write_pictures(job: Job, run: Run, test: list[int]) -> None:
     section = run.renders("path")
     frames = range(section.shape("image")[0])
     fps = job.config.render.fps
-    images.write_video(job.pictures / "path.mp4", (section.read_image("image", i) for i in frames), fps)
+    write_video(job.pictures / "path.mp4", (section.read_image("image", i) for i in frames), fps)
     near, far = _depth_range(section)
     depths = (depth_picture(section.read_image("depth", i), near, far) for i in frames)
-    images.write_video(job.pictures / "path_depth.mp4", depths, fps)
+    write_video(job.pictures / "path_depth.mp4", depths, fps)
 
 
 def _depth_range(section: Section) -> tuple[float, float]:

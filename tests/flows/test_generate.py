@@ -10,12 +10,11 @@ import torch
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.sample_sets import source_boxes
-from flows.images import read_image
+from flows.images import PADDING, read_image, square_image
 from flows.jobs import Job, expected_steps, make_jobs, pending
 from flows.readers.base import InputError
 from flows.run_command import make_config
 from flows.sampling.groups import StoredPlan
-from flows.stages.encode import PADDING, square_image
 from flows.stages.reconstruct import generated_views, no_finer
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore

@@ -26,10 +26,10 @@ from flows.images import (
     undistort,
     write_jpeg,
     write_png,
-    write_video,
 )
 from flows.lens import distort
 from flows.readers.base import InputError
+from flows.video import write_video
 
 
 @pytest.fixture(scope="module")

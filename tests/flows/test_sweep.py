@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 from flows.cli import app
 from flows.results import compare
 from flows.sweep import open_jobs, run_sweep, sweep_jobs
-from schemas.config import SceneSource, SweepConfig, merged, parse_config
+from schemas.config import SceneSource, SweepConfig, parse_config
+from schemas.settings import merged
 from schemas.tables import METRICS, TIMINGS, append_rows, read_rows
 from tests.flows.conftest import ROOT, command, environment
 from tests.flows.sampling.scene import random_model

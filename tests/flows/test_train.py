@@ -20,7 +20,6 @@ from cat3d_core.diffusion.pretrained import export_2d
 from cat3d_core.synthetic import FAMILIES
 from flows.images import read_image
 from flows.readers.base import InputError
-from flows.run_command import settings_document
 from flows.train_command import PRESETS, train_command, training_config
 from flows.training import renders
 from flows.training.autoencoder import draw_images, load_autoencoder
@@ -30,6 +29,7 @@ from flows.training.model import model_config, starting_config, starting_model
 from flows.training.sheets import HeldOut, scores
 from schemas.config import load_config
 from schemas.errors import ConfigError
+from schemas.settings import settings_document
 from schemas.tables import read_rows
 from schemas.training import SAMPLES, TRAINING, Family, TrainRunConfig
 

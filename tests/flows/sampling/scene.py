@@ -10,8 +10,9 @@ import torch
 
 from cat3d_core.diffusion import SIZES, MultiViewModel, save_model
 from flows.jobs import Job, expected_steps, make_jobs, pending
+from flows.locks import writing
 from flows.run_command import make_config
-from flows.scene import ensure_store, execute_stage, prepare_run, writing
+from flows.scene import ensure_store, execute_stage, prepare_run
 from schemas.scene_store import Run, SceneStore
 from schemas.stages import StageRecord
 

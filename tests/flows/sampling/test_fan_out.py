@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from flows.errors import WorkerError
 from flows.jobs import Job, Step, expected_steps
 from flows.sampling import fan_out as fan_out_module
 from flows.sampling.executors import open_executor
@@ -13,7 +14,7 @@ from flows.sampling.fan_out import fan_out
 from flows.sampling.groups import StoredPlan
 from flows.sampling.model import sampler_config
 from flows.sampling.shrinking import sample_at_most
-from flows.sampling.work import Answer, Batch, WorkerError, run_batch
+from flows.sampling.work import Answer, Batch, run_batch
 from flows.stages import sample as sample_stage
 from flows.stages.sample import alike, network_inputs, sample_work
 from schemas.errors import StoreError

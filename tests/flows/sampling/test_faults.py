@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flows.errors import WorkerError
 from flows.jobs import Job
-from flows.sampling.work import WorkerError
 from schemas.documents import leftovers
 from schemas.scene_store import SceneStore
 from schemas.verify import verify

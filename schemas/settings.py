@@ -1,0 +1,51 @@
+"""Settings as nested documents: from the command line, joined, read and written by path."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import yaml
+
+from schemas.errors import ConfigError
+
+
+def merged(*documents: dict[str, Any]) -> dict[str, Any]:
+    """Nested settings, later documents over earlier ones."""
+    out: dict[str, Any] = {}
+    for document in documents:
+        for name, value in document.items():
+            both = isinstance(value, dict) and isinstance(out.get(name), dict)
+            out[name] = merged(out[name], value) if both else value
+    return out
+
+
+def settings_document(settings: Sequence[str]) -> dict[str, Any]:
+    """--set NAME=VALUE options as nested settings. Raises ConfigError for one that can't be read."""
+    document: dict[str, Any] = {}
+    for text in settings:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {text}: write it as NAME=VALUE, e.g. --set render.path_views=30.")
+        try:
+            parsed = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise ConfigError(f"--set {text}: the value is not valid YAML.") from None
+        set_at(document, tuple(name.split(".")), parsed)
+    return document
+
+
+def value_at(document: dict[str, Any], path: tuple[str, ...]) -> Any:
+    """The setting at a path of names."""
+    for part in path:
+        document = document[part]
+    return document
+
+
+def set_at(document: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
+    """Put a setting at a path of names. Raises ConfigError where a value is in the way."""
+    for part in path[:-1]:
+        document = document.setdefault(part, {})
+        if not isinstance(document, dict):
+            raise ConfigError(f"--set {'.'.join(path)}: {part} is a value, not a group of settings.")
+    document[path[-1]] = value
