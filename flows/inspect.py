@@ -30,13 +30,13 @@ MARKERS = {"encode": "latents/done_captured", "sample": "generated/done_latent",
 
 
 def inspect_store(
-    path: str | Path, verify_chunks: bool = False, expected: Mapping[tuple[str | None, str], str] | None = None
+    path: str | Path, verify_chunks: bool = False, expected: Mapping[tuple[str | None, str], set[str]] | None = None
 ) -> dict[str, Any]:
     """Everything about a store, as JSON types. Raises StoreError if it can't be opened at all.
 
-    `expected` maps (run or None, stage) to the content key that stage would have now: a complete stage with another key
-    is stale, and so is every complete stage after it. With `verify_chunks` every chunk is read and its checksum
-    compared; `problems` lists what was found, and `ok` says whether there was anything but leftovers.
+    `expected` maps (run or None, stage) to the content keys it may have now (of a stage that is done once a scene, one
+    for each run): a complete stage with another key is stale, and so is every complete stage after it. With
+    `verify_chunks` every chunk is read and its checksum compared; `problems` lists what was found, and `ok` says whether there was anything but leftovers.
     """
     store = SceneStore.open(path)
     attributes = store.attrs
@@ -118,7 +118,7 @@ def stage_rows(store: SceneStore) -> list[dict[str, Any]]:
 
 
 def stale_stages(
-    store: SceneStore, expected: Mapping[tuple[str | None, str], str]
+    store: SceneStore, expected: Mapping[tuple[str | None, str], set[str]]
 ) -> dict[tuple[str | None, str], str]:
     """Complete stages whose result is out of date, (run or None, stage) -> why."""
     stale: dict[tuple[str | None, str], str] = {}
@@ -131,7 +131,7 @@ def stale_stages(
             continue
         inputs = [(None if name in SCENE_STAGES else run, name) for name in STAGES[stage]]
         changed = [name for owner, name in inputs if (owner, name) in stale]
-        if (run, stage) in expected and record.key != expected[run, stage]:
+        if (run, stage) in expected and record.key not in expected[run, stage]:
             stale[run, stage] = "its inputs, configuration or code have changed"
         elif changed:
             stale[run, stage] = f"{' and '.join(changed)} before it is out of date"

@@ -29,11 +29,11 @@ def inspect_command(path: Path, verify: bool, as_json: bool) -> None:
         raise typer.Exit(1)
 
 
-def expected_keys(path: Path) -> tuple[dict[tuple[str | None, str], str] | None, str]:
-    """The content key each stage of each run would have now, from the jobs that the store remembers; and a remark where
-    the source can't be read any more, so that nothing can be said about staleness."""
+def expected_keys(path: Path) -> tuple[dict[tuple[str | None, str], set[str]] | None, str]:
+    """The content keys each stage of the scene and of each run may have now, from the jobs that the store remembers;
+    and a remark where the source can't be read any more, so that nothing can be said about staleness."""
     store = SceneStore.open(path)
-    expected: dict[tuple[str | None, str], str] = {}
+    expected: dict[tuple[str | None, str], set[str]] = {}
     digests: dict[str, dict] = {}
     for name in store.runs():
         document = store.run(name).attrs.get("job")
@@ -48,5 +48,5 @@ def expected_keys(path: Path) -> tuple[dict[tuple[str | None, str], str] | None,
         except InputError as error:
             return None, f"Whether stages are stale is unknown, since the source can't be read: {error}"
         for stage, step in steps.items():
-            expected[None if stage in SCENE_STAGES else name, stage] = step.key
+            expected.setdefault((None if stage in SCENE_STAGES else name, stage), set()).add(step.key)
     return expected, ""

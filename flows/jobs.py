@@ -195,6 +195,10 @@ def pending(job: Job, steps: dict[str, Step]) -> list[Step]:
         why = stale_reason(store, job.run, step)
         if why:
             out.append(Step(step.stage, step.key, step.inputs, step.config, step.version, why))
+    if not any(step.stage == "sample" for step in out) and store.record("encode") is not None:
+        # Runs with another model's encoder share the scene: its latents are of whoever sampled last, and no other stage
+        # reads them.
+        out = [step for step in out if step.stage != "encode"]
     return out
 
 

@@ -84,11 +84,13 @@ def test_the_cameras_are_summed_up(store: SceneStore) -> None:
 
 
 def test_a_changed_key_makes_its_stage_and_those_after_it_stale(store: SceneStore) -> None:
-    expected = {(run, stage): f"{stage}-key" for run, stage in STAGES}
+    expected = {(run, stage): {f"{stage}-key"} for run, stage in STAGES}
     assert stale_stages(store, expected) == {}
-    changed = {**expected, ("v3", "plan"): "new"}
+    shared = {**expected, (None, "encode"): {"another run's encoder", "encode-key"}}
+    assert stale_stages(store, shared) == {}
+    changed = {**expected, ("v3", "plan"): {"new"}}
     assert list(stale_stages(store, changed)) == [("v3", "plan"), ("v3", "sample")]
-    changed = {**expected, (None, "poses"): "new"}
+    changed = {**expected, (None, "poses"): {"new"}}
     stale = stale_stages(store, changed)
     assert list(stale) == [(None, "poses"), (None, "encode"), ("v3", "plan"), ("v3", "sample")]
     assert stale["v3", "sample"] == "plan and encode before it is out of date"
@@ -123,7 +125,7 @@ def test_damage_is_in_the_report(store: SceneStore) -> None:
 
 def test_the_text_names_every_array_stage_and_problem(store: SceneStore) -> None:
     (store.root / "runs/v3/generated/latent/c.1.0.0.0").write_bytes(b"xx")
-    report = inspect_store(store.root, verify_chunks=True, expected={(None, "ingest"): "new"})
+    report = inspect_store(store.root, verify_chunks=True, expected={(None, "ingest"): {"new"}})
     console = Console(width=200, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     console.print(as_text(report))
     text = console.export_text()

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cat3d_core.diffusion import SIZES, MultiViewModel, save_model
+from flows.jobs import expected_steps, pending
 from flows.sampling.ahead import sample_ahead
 from tests.flows.sampling.scene import make_job, run_of, run_stages
 
@@ -40,3 +41,5 @@ def test_a_run_with_another_encoder_does_not_sample_from_this_ones_latents(
     assert np.array_equal(run_of(first).generated.read("latent"), expected["3"])
     assert run_stages(second, "plan", "encode", "sample")["sample"].work["groups"] > 0
     assert run_of(second).generated.read("latent").shape[-1] == 4
+    for job in (first, second):
+        assert "encode" not in {step.stage for step in pending(job, expected_steps(job, job.capture()))}
