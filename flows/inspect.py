@@ -36,7 +36,8 @@ def inspect_store(
 
     `expected` maps (run or None, stage) to the content keys it may have now (of a stage that is done once a scene, one
     for each run): a complete stage with another key is stale, and so is every complete stage after it. With
-    `verify_chunks` every chunk is read and its checksum compared; `problems` lists what was found, and `ok` says whether there was anything but leftovers.
+    `verify_chunks` every chunk is read and its checksum compared; `problems` lists what was found, and `ok` says
+    whether there was anything but leftovers.
     """
     store = SceneStore.open(path)
     attributes = store.attrs

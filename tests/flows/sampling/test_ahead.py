@@ -39,6 +39,7 @@ def test_a_run_with_another_encoder_does_not_sample_from_this_ones_latents(
     first, second = make_job(tmp_path, checkpoint, "3"), make_job(tmp_path, other, "1")
     sample_ahead([first, second])
     assert np.array_equal(run_of(first).generated.read("latent"), expected["3"])
+    assert run_stages(first, "sample")["sample"].work["groups"] == 0
     assert run_stages(second, "plan", "encode", "sample")["sample"].work["groups"] > 0
     assert run_of(second).generated.read("latent").shape[-1] == 4
     for job in (first, second):
