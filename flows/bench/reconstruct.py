@@ -18,6 +18,7 @@ from cat3d_core.nerf import PRESETS, ReconstructConfig, Trainer, Views, hash_gri
 from cat3d_core.nerf.hash_grid import GridLayout, make_layout, query_reference
 from cat3d_core.normalization import normalize_scene
 from cat3d_core.synthetic import random_cameras, random_scene, trace
+from flows.progress import meter
 
 Times = tuple[float, float]  # wall and processor seconds
 Query = Callable[[Tensor, Tensor, Tensor, GridLayout], tuple[Tensor, Tensor]]
@@ -100,16 +101,18 @@ def curves(
     base = PRESETS[preset]
     if iterations is not None:
         base = dataclasses.replace(base, iterations=iterations, warmup_iterations=iterations // 10)
+    changes = [("preset", {}), *((key, value) for key in vary for value in VARIATIONS[key])]
+    changes = [(key, value) for key, value in changes if not value or dataclasses.replace(base, **value) != base]
     rows = []
-    for family in families:
-        views, held, depths = procedural_views(family, train, test, size, size)
-        for name, change in [("preset", {}), *((key, value) for key in vary for value in VARIATIONS[key])]:
-            config = dataclasses.replace(base, **change)
-            if change and config == base:
-                continue  # the preset itself
-            shown = ", ".join(f"{k}={v}" for k, v in change.items())
-            common = {"family": family, "preset": preset, "varied": name, "setting": shown, "device": device}
-            rows.append(common | train_and_measure(config, views, held, depths, device))
+    with meter(f"{preset}, {', '.join(families)}", len(families) * len(changes)) as progress:
+        for family in families:
+            views, held, depths = procedural_views(family, train, test, size, size)
+            for name, change in changes:
+                shown = ", ".join(f"{k}={v}" for k, v in change.items())
+                common = {"family": family, "preset": preset, "varied": name, "setting": shown, "device": device}
+                measured = train_and_measure(dataclasses.replace(base, **change), views, held, depths, device)
+                rows.append(common | measured)
+                progress.advance(note=f"{measured['psnr_db']:.1f} dB")
     return rows
 
 
