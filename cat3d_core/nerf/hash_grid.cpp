@@ -38,6 +38,7 @@ struct Corners {
     alignas(64) float weight[P];
     alignas(64) float share[8][P];   // trilinear weight times level weight / S; 0 for corners outside a dense level
     alignas(64) uint32_t place[8][P];  // of the corner's first feature in the level's table
+    alignas(64) int32_t cell[3][P];  // of the corner with share 0 and place 0
     alignas(64) int32_t kept[B];     // of each interval, the samples that are left after `merge`: a bit each
 };
 
@@ -113,6 +114,7 @@ void corners(Corners& c, const Block& b, const Level& level, int samples) {
             float sx = b.x[p] * n - 0.5f, sy = b.y[p] * n - 0.5f, sz = b.z[p] * n - 0.5f;
             float cx = std::floor(sx), cy = std::floor(sy), cz = std::floor(sz);
             float fx = sx - cx, fy = sy - cy, fz = sz - cz;
+            c.cell[0][p] = int32_t(cx); c.cell[1][p] = int32_t(cy); c.cell[2][p] = int32_t(cz);
             uint32_t x0 = uint32_t(int32_t(cx)), y0 = uint32_t(int32_t(cy)) * 2654435761u, z0 = uint32_t(int32_t(cz)) * 805459861u;
             uint32_t x1 = x0 + 1u, y1 = y0 + 2654435761u, z1 = z0 + 805459861u;
             float a1 = w * fx, a0 = w - a1, b11 = fy * fz, b10 = fy - b11, b01 = fz - b11, b00 = 1.f - fy - b01;
@@ -136,6 +138,7 @@ void corners(Corners& c, const Block& b, const Level& level, int samples) {
             float cx = std::floor(sx), cy = std::floor(sy), cz = std::floor(sz);
             float fx = sx - cx, fy = sy - cy, fz = sz - cz;
             int32_t x0 = int32_t(cx), y0 = int32_t(cy), z0 = int32_t(cz);
+            c.cell[0][p] = x0; c.cell[1][p] = y0; c.cell[2][p] = z0;
             float ax0 = (x0 >= 0 && x0 < size) ? w * (1.f - fx) : 0.f, ax1 = (x0 >= -1 && x0 < size - 1) ? w * fx : 0.f;
             float ay0 = (y0 >= 0 && y0 < size) ? 1.f - fy : 0.f, ay1 = (y0 >= -1 && y0 < size - 1) ? fy : 0.f;
             float az0 = (z0 >= 0 && z0 < size) ? 1.f - fz : 0.f, az1 = (z0 >= -1 && z0 < size - 1) ? fz : 0.f;
@@ -158,11 +161,18 @@ void corners(Corners& c, const Block& b, const Level& level, int samples) {
 // Samples of an interval that follow each other in one cell have the same eight rows: the first takes the shares of all.
 // Most do at coarse levels, and at all levels where intervals are short, around surfaces.
 void merge(Corners& c, int samples) {
-    Integers same[MAX_S] = {};  // as the sample before: all bits set
+    Integers same[MAX_S] = {}, some = {};  // in the cell of the sample before: all bits set
     for (int s = 1; s < samples; ++s) {
-        same[s] = *(Integers*)(c.place[0] + s * B) == *(Integers*)(c.place[0] + s * B - B);
-        for (int k = 1; k < 8; ++k) same[s] &= *(Integers*)(c.place[k] + s * B) == *(Integers*)(c.place[k] + s * B - B);
+        same[s] = *(Integers*)(c.cell[0] + s * B) == *(Integers*)(c.cell[0] + s * B - B);
+        for (int axis = 1; axis < 3; ++axis) same[s] &= *(Integers*)(c.cell[axis] + s * B) == *(Integers*)(c.cell[axis] + s * B - B);
+        some |= same[s];
     }
+    Integers kept = {};
+    for (int s = 0; s < samples; ++s) kept |= ~same[s] & (1 << s);
+    *(Integers*)c.kept = kept;
+    int32_t any = 0;
+    for (int i = 0; i < B; ++i) any |= some[i];
+    if (!any) return;
     for (int k = 0; k < 8; ++k) {
         Reals sum = *(Reals*)(c.share[k] + (samples - 1) * B);
         for (int s = samples - 1; s > 0; --s) {
@@ -170,9 +180,6 @@ void merge(Corners& c, int samples) {
             *(Reals*)(c.share[k] + (s - 1) * B) = sum;
         }
     }
-    Integers kept = {};
-    for (int s = 0; s < samples; ++s) kept |= ~same[s] & (1 << s);
-    *(Integers*)c.kept = kept;
 }
 
 // Ask for the table's rows ahead, where a level is larger than the innermost cache. Corners that differ in x mostly share
