@@ -32,6 +32,9 @@ class SkipConfig(StrictModel):
     error of the paper's 50 steps of DDIM."""
     detail: bool = True
     """Reconstruct: pixels of generated views finer than those of the finest captured view."""
+    seen: bool = True
+    """Reconstruct: pixels of generated views whose place captured views show as well, and the share of rays that such
+    pixels would have had."""
     empty_space: bool = False
     """Reconstruct, render: queries of the field behind what stops all but a hundredth of a ray's light."""
     proposals: bool = True

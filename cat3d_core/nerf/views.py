@@ -48,13 +48,13 @@ class Views:
         pixels = cameras.size.prod(-1)
         self.offset = pixels.cumsum(0) - pixels
         self.pixels = torch.cat([image.reshape(-1, 3) for image in images])
-        self.valid = None
+        self._count(None)
         if masks is not None:
             whole = [
                 torch.ones(image.shape[:2], dtype=torch.bool) if m is None else m
                 for image, m in zip(images, masks, strict=True)
             ]
-            self.valid = torch.cat([m.reshape(-1).to(torch.bool) for m in whole])
+            self._count(torch.cat([m.reshape(-1).to(torch.bool) for m in whole]))
 
     def __len__(self) -> int:
         return len(self.offset)
@@ -66,6 +66,11 @@ class Views:
             setattr(moved, name, None if value is None else value.to(device))
         return moved
 
+    def image(self, view: int) -> Tensor:
+        """(H, W, 3) uint8 of a view."""
+        width, height = self.size[view].tolist()
+        return self.pixels[int(self.offset[view]) :][: width * height].view(height, width, 3)
+
     def halved(self) -> Views:
         """The views at half the size (box filter; an odd last row or column is dropped, the cameras follow)."""
         images, masks = [], []
@@ -75,9 +80,7 @@ class Views:
             if not width or not height:
                 raise ValueError(f"View {index} is too small to be halved; set low_resolution_iterations to 0.")
             span = slice(int(self.offset[index]), int(self.offset[index]) + int(self.size[index].prod()))
-            whole = self.pixels[span].view(int(self.size[index, 1]), int(self.size[index, 0]), 3)[
-                : 2 * height, : 2 * width
-            ]
+            whole = self.image(index)[: 2 * height, : 2 * width]
             small = functional.avg_pool2d(whole.permute(2, 0, 1).float(), 2).round().to(torch.uint8)
             images.append(small.permute(1, 2, 0).contiguous())
             cameras.append(self.cameras[index].crop(0, 0, 2 * width, 2 * height).resize(width, height))
@@ -90,10 +93,32 @@ class Views:
 
     def without(self, batch: Batch) -> Views:
         """These views with the pixels of a batch masked out."""
+        kept = torch.ones_like(self.pixels[:, 0], dtype=torch.bool)
+        kept[self._index(batch.view, batch.xy)] = False
+        return self.only(kept)
+
+    def only(self, kept: Tensor) -> Views:
+        """These views with all pixels masked out but `kept` (P,) bool, in the order of `pixels`."""
         views = self.to(self.pixels.device)
-        views.valid = torch.ones_like(self.pixels[:, 0], dtype=torch.bool) if self.valid is None else self.valid.clone()
-        views.valid[self._index(batch.view, batch.xy)] = False
+        views._count(kept if self.valid is None else self.valid & kept)
         return views
+
+    def _count(self, valid: Tensor | None) -> None:
+        """Let the pixels `valid` (P,) count, None for all. `counting` (N,) says how many those are of each view."""
+        self.valid, self._places, self._begins = valid, None, self.offset
+        self.counting = self.size.prod(-1)
+        if valid is not None:
+            ends = valid.cumsum(0)[self.offset + self.counting - 1]
+            self._begins = torch.cat([ends.new_zeros(1), ends[:-1]])
+            self.counting, self._places = ends - self._begins, valid.nonzero()[:, 0]
+
+    def pixel(self, view: Tensor, number: Tensor) -> Tensor:
+        """Integer pixels xy (R, 2): of those of views (R,) that count, row by row, the ones with these numbers (R,)."""
+        index = self._begins[view] + number
+        if self._places is not None:
+            index = self._places[index]
+        index, width = index - self.offset[view], self.size[view, 0]
+        return torch.stack([index % width, index // width], -1)
 
     def _index(self, view: Tensor, xy: Tensor) -> Tensor:
         return self.offset[view] + xy[:, 1] * self.size[view, 0] + xy[:, 0]
@@ -118,18 +143,23 @@ class Batch:
 
 
 def _draw_views(views: Views, count: int, captured_share: float, generator: torch.Generator) -> Tensor:
-    """`count` views: uniform, but captured views together have at least the probability `captured_share`."""
-    captured = views.captured.float()
-    number = captured.sum()
-    share = (number / len(captured)).clamp_min(captured_share) if 0 < number < len(captured) else number / len(captured)
-    probability = captured * share / number.clamp_min(1) + (1 - captured) * (1 - share) / (
-        len(captured) - number
-    ).clamp_min(1)
+    """`count` views, each as often as it has pixels that count, of all of its own; but captured views together have at
+    least the probability `captured_share`."""
+    whole = views.counting / views.size.prod(-1)
+    captured, generated = whole * views.captured, whole * ~views.captured
+    share = captured.sum() / whole.sum().clamp_min(1e-9)
+    if 0 < share < 1:
+        share = share.clamp_min(captured_share)
+    probability = captured * share / captured.sum().clamp_min(1e-9)
+    probability = probability + generated * (1 - share) / generated.sum().clamp_min(1e-9)
+    if not probability.any():  # no pixel counts: there is nothing to learn, and nothing to fail at
+        probability = torch.ones_like(probability)
     return torch.multinomial(probability, count, replacement=True, generator=generator)
 
 
 def draw_batch(views: Views, patches: int, patch: int, captured_share: float, generator: torch.Generator) -> Batch:
-    """Draw squares of `patch` pixels (1: single pixels) wholly inside views, each view and corner at random.
+    """Draw squares of `patch` pixels wholly inside views, each view and corner at random; or (1) single pixels, each of
+    those that count.
 
     Raises ValueError where a view is smaller than the patch.
     """
@@ -139,6 +169,10 @@ def draw_batch(views: Views, patches: int, patch: int, captured_share: float, ge
             f"Patches of {patch} pixels do not fit a view whose shorter side is {smallest}; lower patch_size."
         )
     view = _draw_views(views, patches, captured_share, generator)
+    if patch == 1 and views.valid is not None and views.counting.any():
+        number = torch.rand(patches, generator=generator, device=view.device, dtype=torch.float64)
+        xy = views.pixel(view, (number * views.counting[view]).long())
+        return Batch(view, xy, *views.colours(view, xy), patch)
     room = views.size[view] - patch + 1
     corner = (torch.rand((patches, 2), generator=generator, device=view.device, dtype=torch.float64) * room).long()
     ticks = torch.arange(patch, device=view.device)

@@ -15,7 +15,7 @@ from cat3d_core.normalization import Similarity
 from flows.progress import meter
 from flows.readers.base import InputError
 from flows.stages.common import read_cameras, read_images, read_similarity, views_with_role
-from flows.stages.reconstruct import generated_views
+from flows.stages.training_views import generated_views
 from schemas.scene_store import Run, SceneStore
 
 FRAMES = ("world", "scene")

@@ -9,21 +9,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import torch
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.nerf import PRESETS, Field, Trainer, Views, render_image, stepfun
+from cat3d_core.nerf import Field, Views, render_image, stepfun
 from cat3d_core.nerf.render import render_rays
 from cat3d_core.rays import Rays, image_rays
 from cat3d_core.uncertainty import ray_entropy, unseen
 from cat3d_core.view_selection import pose_distance
+from flows.brief import brief_field
 from flows.images import resize
 from flows.jobs import Job
 from flows.sampling.groups import StoredPlan
-from flows.sampling.model import cpu_threads, device, shared_model
+from flows.sampling.model import device, shared_model
 from flows.stages.common import read_cameras, read_images, views_with_role
 from flows.stages.decode import decoded
 from schemas.scene_store import SceneStore
@@ -117,13 +117,8 @@ class Rounds(OneRound):
         return Views(cameras, images, torch.arange(len(cameras)) < len(shown))
 
     def brief_field(self, groups: list[int]) -> Field:
-        """A field trained with the smallest preset."""
-        config = replace(PRESETS["tiny"], lpips_weight=0.0)
-        with cpu_threads(self.job.config.execution.threads):
-            trainer = Trainer(config, self.views(groups), self.job.config.seed, device())
-            while not trainer.finished:
-                trainer.step()
-        return trainer.field
+        """Of the captured views but the held-out one and the views of the groups."""
+        return brief_field(self.views(groups), self.job.config.seed, self.job.config.execution.threads)
 
     def held_out_psnr(self, field: Field) -> float:
         """PSNR in dB of the held-out captured view, at most SIDE pixels on its longer side."""

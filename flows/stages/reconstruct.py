@@ -5,25 +5,21 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
-from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from cat3d_core.cameras import Cameras
 from cat3d_core.metrics.perceptual import find_perceptual, perceptual_name
 from cat3d_core.nerf import PRESETS, Field, ReconstructConfig, Trainer, Views
-from flows.images import resize
 from flows.jobs import Job, Outcome
 from flows.progress import meter
-from flows.stages.common import read_cameras, read_images, views_with_role
+from flows.stages.training_views import training_views
 from schemas.errors import ConfigError
 from schemas.scene_store import Run, SceneStore
 
-VERSION = 4
+VERSION = 5
 CHECKPOINT_INTERVAL_S = 20.0
 #: `skip.rays`: steps that see as many rays as there are pixels, at least, and the fewest rays of a step. With generated
 #: views, whose pixels are many and uncertain, a step does with this share of its rays if all steps together still see
@@ -93,7 +89,7 @@ def inputs(job: Job) -> dict[str, Any]:
     perceptual = perceptual_name() if config.lpips_weight > 0 else None
     rays = [PASSES, FEWEST_RAYS, GENERATED_SHARE, LEAST_PASSES] if job.config.skip.rays else False
     found: dict[str, Any] = {"trainer": dataclasses.asdict(config), "perceptual": perceptual, "rays": rays}
-    found["detail"] = job.config.skip.detail
+    found |= {"detail": job.config.skip.detail, "seen": job.config.skip.seen}
     if job.config.skip.plateau:
         found["plateau"] = [FEW_VIEWS, PATIENT, GENERATED]
     return found
@@ -103,8 +99,8 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     """Train the field, write `field/` (parameters, training record); goes on from its checkpoint if it was stopped."""
     run = store.run(job.run)
     config = trainer_config(job)
-    views, decisions = training_views(job, store, run)
-    config, told = fitted(job, config, views)
+    views, seen, decisions = training_views(job, store, run)
+    config, told = fitted(job, config, views, seen)
     decisions += told
     smallest = int(views.size.min())
     if config.patch_size > smallest:
@@ -146,8 +142,9 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     return Outcome({"views": len(views), "steps": trainer.iteration - resumed, "rays": rays}, decisions)
 
 
-def fitted(job: Job, config: ReconstructConfig, views: Views) -> tuple[ReconstructConfig, list[str]]:
-    """The settings where they depend on what there is to train on, and why; overrides of the run stay."""
+def fitted(job: Job, config: ReconstructConfig, views: Views, seen: float = 0.0) -> tuple[ReconstructConfig, list[str]]:
+    """The settings where they depend on what there is to train on, and why; overrides of the run stay. seen: share of
+    the generated pixels that is left out, as captured views show it."""
     skip, captured = job.config.skip, int(views.captured.sum())
     changes: dict[str, Any] = {}
     decisions = []
@@ -156,7 +153,8 @@ def fitted(job: Job, config: ReconstructConfig, views: Views) -> tuple[Reconstru
     if skip.plateau:
         changes |= GENERATED if captured < len(views) else {}
         changes |= PATIENT if captured > FEW_VIEWS else {}
-    rays, why = enough_rays(config, len(views.pixels), captured < len(views))
+    changes |= {"captured_share": max(config.captured_share, seen)}
+    rays, why = enough_rays(config, int(views.counting.sum()), captured < len(views))
     if skip.rays and rays < config.batch_rays:
         changes |= {"batch_rays": rays}
         decisions.append(f"{rays} instead of {config.batch_rays} rays a step: {why}.")
@@ -192,53 +190,6 @@ def skip_decisions(trainer: Trainer) -> list[str]:
             "held-out pixels no longer improved, and a cool-down ended the training."
         )
     return out
-
-
-def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[str]]:
-    """The run's training views: captured ones, and the generated ones where the run has them."""
-    train = views_with_role(store, run, "train")
-    cameras = read_cameras(store.captured, train)
-    images = read_images(store.captured, train)
-    decisions = []
-    if job.config.method == "zipnerf":
-        decisions.append("No views were generated: method zipnerf trains on captured views alone.")
-    else:
-        made = list(generated_views(run))
-        if job.config.skip.detail:
-            # It would be learned at the cost of what all views have in common (docs/sweeps.md).
-            finest = float(cameras.intrinsics[:, 0, 0].max())
-            whole, made = made, [no_finer(*view, finest) for view in made]
-            reduced = [(a, b) for (_, a), (_, b) in zip(whole, made, strict=True) if a is not b]
-            if reduced:
-                share = sum(b.numel() for _, b in reduced) / sum(a.numel() for a, _ in reduced)
-                decisions.append(
-                    f"{len(reduced)} of {len(made)} generated views were reduced to {share:.0%} of their pixels: "
-                    "no captured view shows finer detail."
-                )
-        cameras = Cameras.cat([cameras, *(camera for camera, _ in made)])
-        images += [image for _, image in made]
-        if not made:
-            decisions.append("Trained on captured views alone, without the LPIPS loss: no view was generated.")
-    captured = torch.arange(len(cameras)) < len(train)
-    return Views(cameras, images, captured), decisions
-
-
-def generated_views(run: Run) -> Iterator[tuple[Cameras, torch.Tensor]]:
-    """The generated views that are there: camera and (h, w, 3) uint8 image of the part that isn't padding."""
-    shown = np.flatnonzero(run.generated.read("done_image").any(-1)).tolist()
-    cameras, windows = read_cameras(run.plan, shown), run.plan.read("window", shown).tolist()
-    for i, (view, (x0, y0, width, height)) in enumerate(zip(shown, windows, strict=True)):
-        image = run.generated.read("image", [view])[0, y0 : y0 + height, x0 : x0 + width]
-        yield cameras[i].crop(x0, y0, width, height), torch.from_numpy(np.ascontiguousarray(image))
-
-
-def no_finer(camera: Cameras, image: torch.Tensor, focal: float) -> tuple[Cameras, torch.Tensor]:
-    """A view (one camera, (h, w, 3) uint8), reduced where its focal length in pixels is longer than `focal`."""
-    scale = focal / float(camera.intrinsics[0, 0, 0])
-    if scale >= 1:
-        return camera, image
-    width, height = (max(1, round(side * scale)) for side in camera.size[0].tolist())
-    return camera.resize(width, height), torch.from_numpy(resize(image.numpy(), width, height))
 
 
 def write_field(run: Run, field: Field, record: list[list[float]]) -> None:

@@ -15,7 +15,7 @@ from flows.jobs import Job, expected_steps, make_jobs, pending
 from flows.readers.base import InputError
 from flows.run_command import make_config
 from flows.sampling.groups import StoredPlan
-from flows.stages.reconstruct import generated_views, no_finer
+from flows.stages.training_views import generated_views, no_finer
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
 from schemas.tables import TIMINGS, read_rows

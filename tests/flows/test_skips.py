@@ -20,8 +20,9 @@ from flows.sampling.groups import StoredPlan
 from flows.sampling.model import shared_model
 from flows.stages import sample as sample_stage
 from flows.stages.common import read_cameras, read_images
-from flows.stages.reconstruct import fitted, generated_views, read_field, trainer_config, training_views
+from flows.stages.reconstruct import fitted, read_field, trainer_config
 from flows.stages.sample import group_sampler, network_inputs
+from flows.stages.training_views import generated_views, training_views
 from schemas.config import parse_config
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
@@ -69,7 +70,7 @@ def test_all_none_and_single_switches() -> None:
 
 def test_a_switch_makes_its_own_stage_stale_and_none_before_it(model: Path, tmp_path: Path) -> None:
     first = {"coverage": "plan", "covered_path": "plan", "rounds": "sample", "near_steps": "sample", "solver": "sample",
-             "guidance": "sample", "workers": None, "detail": "reconstruct",
+             "guidance": "sample", "workers": None, "detail": "reconstruct", "seen": "reconstruct",
              "empty_space": "reconstruct", "proposals": "reconstruct", "plateau": "reconstruct",
              "rays": "reconstruct", "lpips": "reconstruct",
              "low_resolution": "reconstruct"}  # fmt: skip
@@ -233,15 +234,33 @@ def test_generated_views_are_no_finer_than_the_photos_and_it_is_said(model: Path
     one = job(tmp_path, model, "skip=none")
     run_stages(one, *UP_TO_FIELD[:-1])
     store = SceneStore.open(one.store_path)
-    whole, told = training_views(one, store, store.run(one.run))
-    assert told == []
+    whole, share, told = training_views(one, store, store.run(one.run))
+    assert (share, told) == (0.0, [])
     assert whole.size[3:].tolist() == [[64, 64]] * VIEWS
-    reduced, told = training_views(job(tmp_path, model, "skip={detail: true}"), store, store.run(one.run))
+    reduced, _, told = training_views(job(tmp_path, model, "skip={detail: true}"), store, store.run(one.run))
     assert told[0].startswith(f"{VIEWS} of {VIEWS} generated views were reduced to ")
     assert len(reduced) == len(whole) == 3 + VIEWS
     assert torch.equal(reduced.size[:3], whole.size[:3])
     assert bool((reduced.size[3:] < 64).all())
     assert len(reduced.pixels) < len(whole.pixels)
+
+
+def test_what_captured_views_show_is_not_learned_from_generated_ones(model: Path, tmp_path: Path) -> None:
+    one = job(tmp_path, model, "skip={seen: true, covered_path: false, coverage: false}")
+    records = run_stages(one, *UP_TO_FIELD)
+    told = next(d for d in records["reconstruct"].decisions if "captured views show their places as well" in d)
+    store = SceneStore.open(one.store_path)
+    views, share, _ = training_views(one, store, store.run(one.run))
+    assert 0.05 < share < 0.95
+    assert told.startswith(f"{share:.0%} of the pixels")
+    counting = views.counting
+    assert torch.equal(counting[:3], views.size[:3].prod(-1)), "captured pixels all count"
+    assert int(counting[3:].sum()) == pytest.approx((1 - share) * int(views.size[3:].prod(-1).sum()), abs=1)
+    assert fitted(one, trainer_config(one), views, 0.9)[0].captured_share == 0.9
+    single = job(tmp_path / "single", model, "skip={seen: true}", split="1")
+    told_of_one = run_stages(single, *UP_TO_FIELD)["reconstruct"].decisions
+    assert not any("captured views show" in d for d in told_of_one), "one view alone has no depth"
+    assert not problems(one)
 
 
 def test_training_fits_what_there_is_to_train_on(model: Path, tmp_path: Path) -> None:

@@ -170,6 +170,27 @@ def test_patches_lie_inside_mixed_sizes_and_captured_views_are_emphasised() -> N
         draw_batch(views, 1, 32, 0.1, torch.Generator())
 
 
+def test_single_pixels_are_drawn_from_those_that_count_alike() -> None:
+    views = _views(3, captured=1)
+    kept = torch.ones(len(views.pixels), dtype=torch.bool)
+    kept[480:960] = torch.arange(480) % 48 == 5  # ten pixels of the second view
+    kept[960:] = False  # none of the third
+    some = views.only(kept)
+    assert some.counting.tolist() == [480, 10, 0]
+    assert views.valid is None, "the others stay as they are"
+    batch = draw_batch(some, 4000, 1, 0.5, torch.Generator().manual_seed(0))
+    assert batch.valid.all()
+    flat = some.offset[batch.view] + batch.xy[:, 1] * some.size[batch.view, 0] + batch.xy[:, 0]
+    counts = torch.bincount(flat, minlength=len(kept))
+    assert not counts[~kept].any()
+    assert counts[:480].float().mean() == pytest.approx(8.2, abs=0.1), "480 to about 10 of 490: more than half"
+    assert (counts[480:960][kept[480:960]] > 0).all()
+    patches = draw_batch(some, 200, 8, 0.5, torch.Generator().manual_seed(0))
+    assert (patches.view < 2).all(), "no patch from a view without a pixel that counts"
+    nothing = views.only(torch.zeros_like(kept))
+    assert not draw_batch(nothing, 8, 1, 0.5, torch.Generator().manual_seed(0)).valid.any()
+
+
 def test_views_name_the_view_that_does_not_fit() -> None:
     cameras = _cameras(2)
     good = torch.zeros((20, 24, 3), dtype=torch.uint8)

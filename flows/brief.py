@@ -1,0 +1,50 @@
+"""What a field trained briefly on the captured views knows: enough to choose by, in seconds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from cat3d_core.cameras import Cameras
+from cat3d_core.nerf import PRESETS, Field, Trainer, Views, render_image
+from cat3d_core.uncertainty import shown_elsewhere
+from flows.sampling.model import cpu_threads, device
+
+#: Longer side of the depth maps that say what captured views show, in pixels.
+SIDE = 64
+
+
+def brief_field(views: Views, seed: int, threads: int) -> Field:
+    """A field trained with the smallest preset."""
+    config = replace(PRESETS["tiny"], lpips_weight=0.0)
+    with cpu_threads(threads):
+        trainer = Trainer(config, views, seed, device())
+        while not trainer.finished:
+            trainer.step()
+    return trainer.field
+
+
+def shown_by_captured(views: Views, seed: int, threads: int) -> Tensor:
+    """(P,) bool, in the order of `views.pixels`: pixels of generated views whose point a captured view shows as well.
+
+    Where that point is says a field trained briefly on the captured views (at least two: one has no depth)."""
+    captured, generated = (torch.nonzero(chosen)[:, 0].tolist() for chosen in (views.captured, ~views.captured))
+    known = views.cameras[captured]
+    field = brief_field(Views(known, [views.image(v) for v in captured], views.captured[captured]), seed, threads)
+    with cpu_threads(threads):
+        depths = [_depth(field, known, view) for view in range(len(captured))]
+        found = torch.zeros(len(views.pixels), dtype=torch.bool)
+        for view in generated:
+            width, height = views.size[view].tolist()
+            shown = shown_elsewhere(_depth(field, views.cameras, view), views.cameras[[view]], known, depths)
+            shown = torch.nn.functional.interpolate(shown[None, None].float(), (height, width), mode="nearest-exact")
+            first = int(views.offset[view])
+            found[first : first + width * height] = shown.flatten() > 0
+    return found
+
+
+def _depth(field: Field, cameras: Cameras, view: int) -> Tensor:
+    scale = min(1.0, SIDE / int(cameras.size[view].max()))
+    return render_image(field, cameras, view, resolution_scale=scale).depth.cpu()

@@ -1,0 +1,82 @@
+"""What a run is reconstructed from: captured and generated views, without what the scene does not need of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from cat3d_core.cameras import Cameras
+from cat3d_core.nerf import Views
+from flows.brief import shown_by_captured
+from flows.images import resize
+from flows.jobs import Job
+from flows.stages.common import read_cameras, read_images, views_with_role
+from schemas.scene_store import Run, SceneStore
+
+
+def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, float, list[str]]:
+    """The run's training views: captured ones, and the generated ones where the run has them; which share of the
+    generated pixels is left out, as captured views show them too; what was decided."""
+    train = views_with_role(store, run, "train")
+    cameras = read_cameras(store.captured, train)
+    images = read_images(store.captured, train)
+    decisions = []
+    if job.config.method == "zipnerf":
+        decisions.append("No views were generated: method zipnerf trains on captured views alone.")
+    else:
+        made = list(generated_views(run))
+        if job.config.skip.detail:
+            # It would be learned at the cost of what all views have in common (docs/sweeps.md).
+            finest = float(cameras.intrinsics[:, 0, 0].max())
+            whole, made = made, [no_finer(*view, finest) for view in made]
+            reduced = [(a, b) for (_, a), (_, b) in zip(whole, made, strict=True) if a is not b]
+            if reduced:
+                share = sum(b.numel() for _, b in reduced) / sum(a.numel() for a, _ in reduced)
+                decisions.append(
+                    f"{len(reduced)} of {len(made)} generated views were reduced to {share:.0%} of their pixels: "
+                    "no captured view shows finer detail."
+                )
+        cameras = Cameras.cat([cameras, *(camera for camera, _ in made)])
+        images += [image for _, image in made]
+        if not made:
+            decisions.append("Trained on captured views alone, without the LPIPS loss: no view was generated.")
+    captured = torch.arange(len(cameras)) < len(train)
+    views, share, told = unseen_alone(job, Views(cameras, images, captured))
+    return views, share, decisions + told
+
+
+def generated_views(run: Run) -> Iterator[tuple[Cameras, torch.Tensor]]:
+    """The generated views that are there: camera and (h, w, 3) uint8 image of the part that isn't padding."""
+    shown = np.flatnonzero(run.generated.read("done_image").any(-1)).tolist()
+    cameras, windows = read_cameras(run.plan, shown), run.plan.read("window", shown).tolist()
+    for i, (view, (x0, y0, width, height)) in enumerate(zip(shown, windows, strict=True)):
+        image = run.generated.read("image", [view])[0, y0 : y0 + height, x0 : x0 + width]
+        yield cameras[i].crop(x0, y0, width, height), torch.from_numpy(np.ascontiguousarray(image))
+
+
+def no_finer(camera: Cameras, image: torch.Tensor, focal: float) -> tuple[Cameras, torch.Tensor]:
+    """A view (one camera, (h, w, 3) uint8), reduced where its focal length in pixels is longer than `focal`."""
+    scale = focal / float(camera.intrinsics[0, 0, 0])
+    if scale >= 1:
+        return camera, image
+    width, height = (max(1, round(side * scale)) for side in camera.size[0].tolist())
+    return camera.resize(width, height), torch.from_numpy(resize(image.numpy(), width, height))
+
+
+def unseen_alone(job: Job, views: Views) -> tuple[Views, float, list[str]]:
+    """The views without those pixels of generated ones that captured ones show as well, which share of the generated
+    pixels those are, and what was decided. One captured view alone says of no pixel where it is."""
+    captured = int(views.captured.sum())
+    if not job.config.skip.seen or captured == len(views) or captured < 2:
+        return views, 0.0, []
+    started = time.monotonic()
+    shown = shown_by_captured(views, job.config.seed, job.config.execution.threads)
+    share = float(shown.sum() / views.size[~views.captured].prod(-1).sum())
+    told = (
+        f"{share:.0%} of the pixels of generated views were not trained on: captured views show their places as well, "
+        f"says a field of those alone ({time.monotonic() - started:.0f} s). So large a share of the rays is theirs."
+    )
+    return views.only(~shown), share, [told]
