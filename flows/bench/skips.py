@@ -44,8 +44,8 @@ QUICK_BASE = ("method=cat3d", "plan.views=10", "render.path_views=2", "reconstru
 #: What is measured alone, by family: switches that act where the path has a gap, and where captured views cover it.
 #: (`guidance` changes nothing for the shipped model, whose file asks for none; `rays` acts on few views.)
 ALONE = {
-    "dtu": ("coverage", "rounds", "near_steps", "solver", "workers", "detail", "empty_space", "proposals",
-            "lpips", "low_resolution", "plateau"),
+    "dtu": ("coverage", "rounds", "near_steps", "solver", "workers", "detail", "seen", "empty_space",
+            "proposals", "lpips", "low_resolution", "plateau"),
     "re10k": ("covered_path",),
 }  # fmt: skip
 SWITCHES = tuple(SkipConfig.model_fields)
