@@ -22,10 +22,10 @@ def ray_entropy(weights: Tensor) -> Tensor:
     return torch.special.entr(share).sum(-1) / math.log(share.shape[-1])
 
 
-def shown_elsewhere(
+def shown_by(
     depth: Tensor, camera: Cameras, known: Cameras, known_depth: Sequence[Tensor], tolerance: float = 0.05
 ) -> Tensor:
-    """(H, W) bool: pixels of a camera (one) that one of the N known views shows too.
+    """(H, W) int64: how many of the N known views show what a pixel of a camera (one) shows.
 
     depth (H, W): z-depth along the camera's rays, at any resolution; known_depth: N of them, each of any size, of what
     the known cameras see themselves. A pixel's point is shown by a view whose own depth there is the point's z within
@@ -35,14 +35,14 @@ def shown_elsewhere(
     rays = image_rays(camera, 0, width, height)
     points = rays.origins + depth.reshape(-1, 1).to(rays.origins) * rays.directions
     pixels, z = known.project(points.to(known.intrinsics))
-    found = torch.zeros(height * width, dtype=torch.bool)
+    count = torch.zeros(height * width, dtype=torch.int64)
     for view, seen in enumerate(known_depth):
         size = torch.tensor(seen.shape[::-1]).to(pixels)
         place = (pixels[view] * size / known.size[view].to(pixels)).floor()
         inside = (z[view] > 0) & (place >= 0).all(-1) & (place < size).all(-1)
         column, row = torch.where(inside[:, None], place, 0.0).long().unbind(-1)
-        found |= inside & ((seen[row, column].to(z) - z[view]).abs() < tolerance * z[view])
-    return found.view(height, width)
+        count += inside & ((seen[row, column].to(z) - z[view]).abs() < tolerance * z[view])
+    return count.view(height, width)
 
 
 def unseen(points: Tensor, cameras: Cameras) -> Tensor:

@@ -9,9 +9,11 @@ from torch import Tensor
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.nerf import PRESETS, Field, Trainer, Views, render_image
-from cat3d_core.uncertainty import shown_elsewhere
+from cat3d_core.uncertainty import shown_by
 from flows.sampling.model import cpu_threads, device
 
+#: Captured views that have to show a place: what a single one shows may float anywhere before it.
+LEAST = 2
 #: Longer side of the depth maps that say what captured views show, in pixels.
 SIDE = 64
 
@@ -27,9 +29,9 @@ def brief_field(views: Views, seed: int, threads: int) -> Field:
 
 
 def shown_by_captured(views: Views, seed: int, threads: int) -> Tensor:
-    """(P,) bool, in the order of `views.pixels`: pixels of generated views whose point a captured view shows as well.
+    """(P,) bool, in the order of `views.pixels`: pixels of generated views whose place LEAST captured views show too.
 
-    Where that point is says a field trained briefly on the captured views (at least two: one has no depth)."""
+    Where that place is says a field trained briefly on the captured views."""
     captured, generated = (torch.nonzero(chosen)[:, 0].tolist() for chosen in (views.captured, ~views.captured))
     known = views.cameras[captured]
     field = brief_field(Views(known, [views.image(v) for v in captured], views.captured[captured]), seed, threads)
@@ -38,10 +40,10 @@ def shown_by_captured(views: Views, seed: int, threads: int) -> Tensor:
         found = torch.zeros(len(views.pixels), dtype=torch.bool)
         for view in generated:
             width, height = views.size[view].tolist()
-            shown = shown_elsewhere(_depth(field, views.cameras, view), views.cameras[[view]], known, depths)
-            shown = torch.nn.functional.interpolate(shown[None, None].float(), (height, width), mode="nearest-exact")
+            count = shown_by(_depth(field, views.cameras, view), views.cameras[[view]], known, depths)
+            count = torch.nn.functional.interpolate(count[None, None].float(), (height, width), mode="nearest-exact")
             first = int(views.offset[view])
-            found[first : first + width * height] = shown.flatten() > 0
+            found[first : first + width * height] = count.flatten() >= LEAST
     return found
 
 

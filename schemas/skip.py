@@ -33,8 +33,8 @@ class SkipConfig(StrictModel):
     detail: bool = True
     """Reconstruct: pixels of generated views finer than those of the finest captured view."""
     seen: bool = True
-    """Reconstruct: pixels of generated views whose place captured views show as well, and the share of rays that such
-    pixels would have had."""
+    """Reconstruct: pixels of generated views whose place two captured views show as well, and the share of rays that
+    such pixels would have had."""
     empty_space: bool = False
     """Reconstruct, render: queries of the field behind what stops all but a hundredth of a ray's light."""
     proposals: bool = True

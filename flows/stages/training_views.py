@@ -10,7 +10,7 @@ import torch
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.nerf import Views
-from flows.brief import shown_by_captured
+from flows.brief import LEAST, shown_by_captured
 from flows.images import resize
 from flows.jobs import Job
 from flows.stages.common import read_cameras, read_images, views_with_role
@@ -67,16 +67,17 @@ def no_finer(camera: Cameras, image: torch.Tensor, focal: float) -> tuple[Camera
 
 
 def unseen_alone(job: Job, views: Views) -> tuple[Views, float, list[str]]:
-    """The views without those pixels of generated ones that captured ones show as well, which share of the generated
-    pixels those are, and what was decided. One captured view alone says of no pixel where it is."""
+    """The views without those pixels of generated ones that two captured ones show as well, which share of the
+    generated pixels those are, and what was decided."""
     captured = int(views.captured.sum())
-    if not job.config.skip.seen or captured == len(views) or captured < 2:
+    if not job.config.skip.seen or captured == len(views) or captured < LEAST:
         return views, 0.0, []
     started = time.monotonic()
     shown = shown_by_captured(views, job.config.seed, job.config.execution.threads)
     share = float(shown.sum() / views.size[~views.captured].prod(-1).sum())
     told = (
-        f"{share:.0%} of the pixels of generated views were not trained on: captured views show their places as well, "
-        f"says a field of those alone ({time.monotonic() - started:.0f} s). So large a share of the rays is theirs."
+        f"{share:.0%} of the pixels of generated views were not trained on, since {LEAST} captured views show their "
+        f"places as well: so says a field of those alone ({time.monotonic() - started:.0f} s). At least as large a "
+        "share of the rays is theirs."
     )
     return views.only(~shown), share, [told]

@@ -14,7 +14,7 @@ from cat3d_core.diffusion.sampler import evaluations
 from cat3d_core.plan import COVERED_DEG, PlanConfig, make_plan
 from cat3d_core.rays import image_rays
 from cat3d_core.trajectories import scene_frame
-from cat3d_core.uncertainty import ray_entropy, shown_elsewhere, unseen
+from cat3d_core.uncertainty import ray_entropy, shown_by, unseen
 from tests.core.diffusion.models import random_model
 from tests.core.plan.layouts import ring
 
@@ -87,19 +87,20 @@ def test_pixels_whose_place_another_view_shows(side: int) -> None:
     views = around([80, 100, 260])  # two before the wall, the third behind it
     depths = [wall_depth(views[[v]], side, side) for v in range(3)]
     first = views[[0]]
-    assert shown_elsewhere(depths[0], first, first, depths[:1]).all(), "a view shows what it shows"
-    both = shown_elsewhere(depths[0], first, views[[1]], depths[1:2])
+    assert (shown_by(depths[0], first, first, depths[:1]) == 1).all(), "a view shows what it shows"
+    both = shown_by(depths[0], first, views[[1]], depths[1:2]) == 1
     rays = image_rays(first, 0, side, side)
     pixels, _ = views[[1]].project(rays.origins + depths[0].reshape(-1, 1) * rays.directions)
     inside = ((pixels[0] >= 0) & (pixels[0] < 64)).all(-1).view(side, side)
     assert 0.5 < both.double().mean() < 1
     assert torch.equal(both, inside), "where the images overlap, and nowhere else"
     nearer = [0.9 * d for d in depths[1:2]]
-    assert not shown_elsewhere(depths[0], first, views[[1]], nearer).any(), "something stands before the wall"
+    assert not shown_by(depths[0], first, views[[1]], nearer).any(), "something stands before the wall"
     about = torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64))
     away = Cameras(first.intrinsics, first.world_from_camera @ about, first.size)
-    assert not shown_elsewhere(depths[0], first, away, depths[:1]).any(), "it looks the other way"
-    assert shown_elsewhere(depths[0], first, views[[1, 0]], [nearer[0], depths[0]]).all(), "one view is enough"
+    assert not shown_by(depths[0], first, away, depths[:1]).any(), "it looks the other way"
+    two = shown_by(depths[0], first, views[[1, 0]], [depths[1], depths[0]])
+    assert torch.equal(two, 1 + both.long())
 
 
 @pytest.mark.parametrize(("scale", "high"), [(1.0, math.inf), (3.0, math.inf), (3.0, 2.0), (3.0, -30.0)])
