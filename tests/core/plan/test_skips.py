@@ -101,6 +101,9 @@ def test_pixels_whose_place_another_view_shows(side: int) -> None:
     assert not shown_by(depths[0], first, away, depths[:1]).any(), "it looks the other way"
     two = shown_by(depths[0], first, views[[1, 0]], [depths[1], depths[0]])
     assert torch.equal(two, 1 + both.long())
+    for nowhere in (math.inf, math.nan, -1.0, 0.0, 1e300):
+        assert not shown_by(torch.full_like(depths[0], nowhere), first, views[[1]], depths[1:2]).any(), nowhere
+        assert not shown_by(depths[0], first, views[[1]], [torch.full_like(depths[1], nowhere)]).any(), nowhere
 
 
 @pytest.mark.parametrize(("scale", "high"), [(1.0, math.inf), (3.0, math.inf), (3.0, 2.0), (3.0, -30.0)])
