@@ -9,12 +9,13 @@ from torch import Tensor
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.nerf import PRESETS, Field, Trainer, Views, render_image
+from cat3d_core.nerf.render import Render
 from cat3d_core.uncertainty import shown_by
 from flows.sampling.model import cpu_threads, device
 
 #: Captured views that have to show a place: what a single one shows may float anywhere before it.
 LEAST = 2
-#: Longer side of the depth maps that say what captured views show, in pixels.
+#: Longer side of the pictures of such a field, in pixels.
 SIDE = 64
 
 
@@ -28,6 +29,11 @@ def brief_field(views: Views, seed: int, threads: int) -> Field:
     return trainer.field
 
 
+def brief_render(field: Field, cameras: Cameras, view: int) -> Render:
+    """What a camera sees of a field, at most SIDE pixels on the longer side."""
+    return render_image(field, cameras, view, resolution_scale=min(1.0, SIDE / int(cameras.size[view].max())))
+
+
 def shown_by_captured(views: Views, seed: int, threads: int) -> Tensor:
     """(P,) bool, in the order of `views.pixels`: pixels of generated views whose place LEAST captured views show too.
 
@@ -36,17 +42,13 @@ def shown_by_captured(views: Views, seed: int, threads: int) -> Tensor:
     known = views.cameras[captured]
     field = brief_field(Views(known, [views.image(v) for v in captured], views.captured[captured]), seed, threads)
     with cpu_threads(threads):
-        depths = [_depth(field, known, view) for view in range(len(captured))]
+        depths = [brief_render(field, known, view).depth.cpu() for view in range(len(captured))]
         found = torch.zeros(len(views.pixels), dtype=torch.bool)
         for view in generated:
             width, height = views.size[view].tolist()
-            count = shown_by(_depth(field, views.cameras, view), views.cameras[[view]], known, depths)
+            depth = brief_render(field, views.cameras, view).depth.cpu()
+            count = shown_by(depth, views.cameras[[view]], known, depths)
             count = torch.nn.functional.interpolate(count[None, None].float(), (height, width), mode="nearest-exact")
             first = int(views.offset[view])
             found[first : first + width * height] = count.flatten() >= LEAST
     return found
-
-
-def _depth(field: Field, cameras: Cameras, view: int) -> Tensor:
-    scale = min(1.0, SIDE / int(cameras.size[view].max()))
-    return render_image(field, cameras, view, resolution_scale=scale).depth.cpu()

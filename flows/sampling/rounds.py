@@ -14,12 +14,12 @@ import numpy as np
 import torch
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.nerf import Field, Views, render_image, stepfun
+from cat3d_core.nerf import Field, Views, stepfun
 from cat3d_core.nerf.render import render_rays
 from cat3d_core.rays import Rays, image_rays
 from cat3d_core.uncertainty import ray_entropy, unseen
 from cat3d_core.view_selection import pose_distance
-from flows.brief import brief_field
+from flows.brief import brief_field, brief_render
 from flows.images import resize
 from flows.jobs import Job
 from flows.sampling.groups import StoredPlan
@@ -33,8 +33,8 @@ SHARE, GAIN_DB = 0.25, 0.1
 #: A brief reconstruction in floating-point operations of a denoiser that take as long: on a CPU 11 s, in which the
 #: shipped model does 660 GFLOP (64 evaluations, 240 GFLOP, take 4 s). Choosing takes three of them at least.
 BRIEF_FLOPS, BRIEF_FIELDS = 6.6e11, 3
-#: Longer side of the pictures that decide, and of those whose rays say what the field knows, in pixels.
-SIDE, PROBE_SIDE = 64, 16
+#: Longer side of the pictures whose rays say what the field knows, in pixels.
+PROBE_SIDE = 16
 
 
 class OneRound:
@@ -121,10 +121,9 @@ class Rounds(OneRound):
         return brief_field(self.views(groups), self.job.config.seed, self.job.config.execution.threads)
 
     def held_out_psnr(self, field: Field) -> float:
-        """PSNR in dB of the held-out captured view, at most SIDE pixels on its longer side."""
+        """PSNR in dB of the held-out captured view, as `brief_render` shows it."""
         camera = read_cameras(self.store.captured, [self.held_out]).to(dtype=torch.float32)
-        scale = min(1.0, SIDE / int(camera.size.max()))
-        image = render_image(field, camera, 0, resolution_scale=scale).image.cpu()
+        image = brief_render(field, camera, 0).image.cpu()
         truth = resize(self.store.captured.read_image("image", self.held_out), image.shape[1], image.shape[0])
         return -10 * math.log10(float((image - torch.from_numpy(truth) / 255).square().mean()) + 1e-10)
 
