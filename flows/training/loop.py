@@ -76,12 +76,12 @@ def optimizer_step(
     losses, record, views = [], {}, config.model.views
     for _ in range(config.optimizer.accumulate):
         key = (trainer.calls, ranks.rank)
-        latents, rays = bank.batch(
+        latents, cameras = bank.batch(
             config.optimizer.groups, views, config.seed, *key, spread=spread_at(config, done)
         )  # fmt: skip
-        rays = jitter_scale(rays, config.scale_jitter, generator(config.seed, "jitter", *key))
+        cameras = jitter_scale(cameras, config.scale_jitter, generator(config.seed, "jitter", *key))
         modes = config.conditions if done >= config.joint_from else config.conditions[:1]
-        record = trainer.step(latents, rays, modes[trainer.calls % len(modes)])
+        record = trainer.step(latents, cameras, modes[trainer.calls % len(modes)])
         losses.append(record["loss"])
     return record | {"loss": sum(losses) / len(losses)}
 
