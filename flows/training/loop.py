@@ -18,6 +18,7 @@ from cat3d_core.diffusion import (
     save_model,
     save_state,
 )  # fmt: skip
+from cat3d_core.generation import Cat3dGenerator
 from cat3d_core.random import generator
 from flows.progress import meter
 from flows.training.bank import jitter_scale
@@ -183,6 +184,7 @@ def write_samples(config: TrainRunConfig, folder: Path, trainer: Trainer, scenes
     name, given = f"step_{trainer.steps:08d}", max(config.conditions)
     if (folder / SHEETS / f"{name}.png").exists():
         return
-    images = sampled(trainer.ema_model().to(trainer.device), scenes, given, config.sample_steps)
+    generator = Cat3dGenerator(trainer.ema_model().to(trainer.device))
+    images = sampled(generator, scenes, given, config.sample_steps)
     append_rows(folder / SHEETS, SAMPLES, scores(images, scenes, given, trainer.steps), name)
     write_sheet(folder / SHEETS / f"{name}.png", images, scenes, given)
