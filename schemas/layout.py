@@ -57,9 +57,9 @@ K_ROW, K_COLUMN, ROW, COLUMN = Dim("k_row", 3), Dim("k_column", 3), Dim("row", 4
 class ArraySpec:
     """One array of the layout.
 
-    kind: how it is stored (`schemas/arrays.py`). dims: None where the shape is free. unit: "1" for plain numbers,
-    "" for text. done: the array of 32-byte content keys that says which views are there. coordinate: it labels the entries of
-    its section, so xarray lists it among the coordinates.
+    kind: how it is stored (`schemas/arrays.py`). dims: None where the shape is free. unit: "1" for plain numbers, ""
+    for text. done: the array of 32-byte content keys that says which views are there. coordinate: the array labels the
+    entries of its section, and xarray lists it among the coordinates.
     """
 
     path: str
