@@ -88,9 +88,9 @@ class Plan:
 
     cameras: N sample cameras, square, float64. path (N,): index of the path. window (N, 4): [x0, y0, width, height] of
     the sample to keep. groups: each view is a target of one. recipe: name. reasons: why, in sentences. frame: the scene
-    as the plan saw it (None where an older program stored the plan). captured_count: V. captured_coverage, plan_coverage: before and after (captured and planned
-    views together). needed: False where captured views cover the path already (`PlanConfig.covered_share`): sample
-    nothing.
+    as the plan saw it (None where an older program stored the plan). captured_count: V. captured_coverage,
+    plan_coverage: before and after (captured and planned views together). needed: False where captured views cover the
+    path already (`PlanConfig.covered_share`): sample nothing.
     """
 
     cameras: Cameras

@@ -46,8 +46,8 @@ def sample(
     """Latents of target views given conditioning views, for G independent groups.
 
     condition_latents [G, M, C, h, w]; cameras [G, M+N, 4, 4], conditioning views first, seen from the first of them
-    (`rays.reference_from_image`); noise [G, N, C, h, w] standard normal, keyed by view. Returns [G, N, C, h, w] float32 (float64 for float64
-    noise; the network runs in the dtype of its weights).
+    (`rays.reference_from_image`); noise [G, N, C, h, w] standard normal, keyed by view. Returns [G, N, C, h, w] float32
+    (float64 for float64 noise; the network runs in the dtype of its weights).
     Groups with fewer targets than the model was trained with (views - M) are padded with repeated targets, keeping the
     trained noise shift; the padding is dropped. Raises ValueError for shapes that don't fit together.
     """

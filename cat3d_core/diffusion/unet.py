@@ -74,7 +74,9 @@ class MultiViewUNet(nn.Module):
         mask_map = mask.to(latents.dtype)[:, :, None, None, None].expand(-1, -1, 1, height, width)
         parts = [latents, mask_map]
         if self.config.camera == "raymap":
-            parts.insert(1, ray_features(matrix_rays(cameras, height, width).to(latents.dtype), self.config.ray_octaves))
+            parts.insert(
+                1, ray_features(matrix_rays(cameras, height, width).to(latents.dtype), self.config.ray_octaves)
+            )
         x = torch.cat(parts, 2).flatten(0, 1).to(dtype)
         context = None
         if self.config.camera == "vector":

@@ -5,4 +5,13 @@ from cat3d_core.generation.generate import generate
 from cat3d_core.generation.memory import MemoryTooSmall
 from cat3d_core.generation.protocol import Cost, Generator, GeneratorSpec, ViewGroup
 
-__all__ = ["Cat3dGenerator", "Cost", "Generator", "GeneratorSpec", "MemoryTooSmall", "ViewGroup", "cat3d_spec", "generate"]
+__all__ = [
+    "Cat3dGenerator",
+    "Cost",
+    "Generator",
+    "GeneratorSpec",
+    "MemoryTooSmall",
+    "ViewGroup",
+    "cat3d_spec",
+    "generate",
+]

@@ -1,4 +1,4 @@
-"""How to sample: the paper's way, the cheapest that is as good on problems with a known answer, and young models' own."""
+"""How to sample: as the paper does, with the least work for the same error, and as suits briefly trained models."""
 
 from __future__ import annotations
 

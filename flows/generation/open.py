@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Protocol, cast
 
 from cat3d_core.generation import Generator, GeneratorSpec
-from flows.jobs.device import device, free_device_memory
 from flows.errors import InputError
+from flows.jobs.device import device, free_device_memory
 from flows.jobs.job import Job
 
 GROUP = "cat3d.generators"

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
+from schemas.decisions import chosen as decided
+from schemas.decisions import skipped
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.rays import Rays, image_rays
@@ -27,8 +29,6 @@ from flows.jobs.access import read_cameras, read_images, views_with_role
 from flows.jobs.device import device
 from flows.jobs.job import Job
 from flows.media.images import resize
-from schemas.decisions import chosen as decided
-from schemas.decisions import skipped
 from schemas.scene_store import SceneStore
 
 #: Share of the plan's groups in a round, and the least gain in PSNR of the held-out view that is worth another one.
@@ -114,7 +114,9 @@ class Rounds(OneRound):
         generator = open_generator(self.job)
         windows = self.plan.plan.window.tolist()
         for view in (v for g in groups for v in self.plan.groups[g].targets):
-            camera, image = in_window(self.plan.cameras[view], decoded(generator, run.generated, view)[0], windows[view])
+            camera, image = in_window(
+                self.plan.cameras[view], decoded(generator, run.generated, view)[0], windows[view]
+            )
             cameras, images = Cameras.cat([cameras, camera]), [*images, image]
         return Views(cameras, images, torch.arange(len(cameras)) < len(shown))
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from cat3d_core.cameras import Cameras
 from cat3d_core.generation import Generator
 from cat3d_core.sample_sets import source_boxes
-from flows.media.images import square_image, to_uint8
 from flows.jobs.access import read_cameras
+from flows.media.images import square_image, to_uint8
 from schemas.scene_store import Run, SceneStore, Section
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from schemas.decisions import skipped
 
 from flows.generation.groups import view_keys
 from flows.generation.open import generator_spec, open_generator
@@ -14,7 +15,6 @@ from flows.jobs.job import Job, Outcome
 from flows.jobs.stage import Stage, generates
 from flows.workers.fan_out import fan_out
 from flows.workers.work import Work, is_done
-from schemas.decisions import skipped
 from schemas.scene_store import SceneStore
 
 
@@ -38,7 +38,17 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     )
     each = [[view] for view in range(views)]
     share = Work(
-        job, "decode", key, open_generator, work, generated, "done_image", "image", view_keys(key, views), [sampled], each
+        job,
+        "decode",
+        key,
+        open_generator,
+        work,
+        generated,
+        "done_image",
+        "image",
+        view_keys(key, views),
+        [sampled],
+        each,
     )
     missing = len(share.passes[0])
     label = f"decode {job.scene_id} {job.run}"

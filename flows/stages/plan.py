@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from schemas.decisions import chosen
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.plan import Plan, PlanConfig, make_plan
@@ -14,9 +15,8 @@ from flows.generation.plan import write_plan
 from flows.jobs.access import read_cameras, views_with_role
 from flows.jobs.job import Job, Outcome
 from flows.jobs.stage import Stage, generates, settings_of
-from schemas.decisions import chosen
 from schemas.errors import ConfigError
-from schemas.scene_store import Run, SceneStore
+from schemas.scene_store import SceneStore
 
 #: `skip.covered_path`: how much of what the path's views see captured views must show from nearby directions.
 COVERED_SHARE = 0.9
@@ -74,12 +74,12 @@ def core_config(job: Job, captured: Cameras) -> PlanConfig:
     conditions = settings.condition_views or max((n for n in spec.given if n <= 3), default=min(spec.given))
     if conditions not in spec.given:
         raise ConfigError(
-            f"plan.condition_views is {conditions}, but the generator takes {', '.join(map(str, spec.given))} given views."
+            f"plan.condition_views is {conditions}, but the generator takes {', '.join(map(str, spec.given))} of them."
         )
     if (total := conditions + (settings.group_size or 1)) > spec.views:
         raise ConfigError(
-            f"plan.condition_views and plan.group_size come to {total} views, but the model takes {spec.views} at once: "
-            "ask for fewer."
+            f"plan.condition_views and plan.group_size come to {total} views, but the model takes {spec.views} at "
+            "once: ask for fewer."
         )
     not_square = bool((captured.size[:, 0] != captured.size[:, 1]).any())
     return PlanConfig(

@@ -8,6 +8,8 @@ from dataclasses import replace
 from itertools import groupby
 from typing import Any
 
+from schemas.decisions import Decision, chosen, skipped
+
 from cat3d_core.diffusion import SamplerConfig
 from cat3d_core.generation import Cost, MemoryTooSmall
 from cat3d_core.plan import Group
@@ -20,7 +22,6 @@ from flows.jobs.job import Job, Outcome
 from flows.jobs.stage import Stage, generates, settings_of
 from flows.workers.fan_out import Totals, fan_out
 from flows.workers.work import Work, is_done
-from schemas.decisions import Decision, chosen, skipped
 from schemas.scene_store import SceneStore
 
 #: `skip.near_steps`: mean pose distance (scene distances, about radians of turning) from a group's views to the nearest
@@ -53,7 +54,9 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     run.generated.mark_skipped("done_latent", left_out)
     decisions = []
     if left_out:
-        saved = sum(group_cost(job, plan.groups[g], group_sampler(job, plan, plan.groups[g])).evaluations for g in spared)
+        saved = sum(
+            group_cost(job, plan.groups[g], group_sampler(job, plan, plan.groups[g])).evaluations for g in spared
+        )
         text = f"{len(left_out)} of {len(plan)} planned views were left out; {saved} network evaluations were saved."
         switch = "rounds" if plan.plan.needed else "covered_path"
         decisions.append(skipped(text, switch, views=len(left_out), evaluations=saved))

@@ -36,8 +36,8 @@ from cat3d_core.synthetic import FAMILIES
 from cat3d_core.synthetic.held_out import held_out_group
 from cat3d_core.synthetic.tracer import Traced
 from cat3d_core.view_selection import camera_distance
-from flows.jobs.device import device
 from flows.errors import InputError
+from flows.jobs.device import device
 from flows.media.images import read_image, square_image, write_png
 from flows.readers.base import read_capture
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import torch
 
-from cat3d_core.diffusion import load_model
 from cat3d_core.diffusion import describe as facts_of
+from cat3d_core.diffusion import load_model
 from cat3d_core.diffusion.config import ModelConfig, from_dict
 from cat3d_core.generation import Cat3dGenerator, GeneratorSpec, cat3d_spec
 from cat3d_core.weights import default_model_path

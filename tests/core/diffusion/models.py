@@ -36,7 +36,7 @@ def random_model(seed: int = 0, **unet_changes: object) -> MultiViewModel:
 
 
 def matrices(groups: int, views: int, generator: torch.Generator) -> torch.Tensor:
-    """Random cameras [groups, views, 4, 4] as the network wants them: any plane of rays, but none that is degenerate."""
+    """Random cameras [groups, views, 4, 4] as the network wants them: any plane of rays, none degenerate."""
     out = torch.eye(4, dtype=torch.float64).repeat(groups, views, 1, 1)
     out[:, :, :3] += 0.5 * torch.rand(groups, views, 3, 4, generator=generator, dtype=torch.float64) - 0.25
     return out

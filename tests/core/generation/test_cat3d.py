@@ -1,4 +1,4 @@
-"""Our own model behind the protocol: what it says of itself, padding, batches, memory, and pictures in, pictures out."""
+"""Our own model behind the protocol: what it says of itself, padding, batches, memory, pictures in and out."""
 
 from __future__ import annotations
 

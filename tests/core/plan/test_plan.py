@@ -223,7 +223,9 @@ def test_groups_are_as_large_as_the_generator_takes(views: int) -> None:
     alone = make_plan(single(), PlanConfig(count=40, image_size=32, views=views))
     check(alone)
     anchors = [group for group in alone.groups if group.anchors]
-    assert [len(group.targets) for group in anchors] == ([7] if views >= 8 else [views - 1] * (7 // (views - 1)) + ([1] if 7 % (views - 1) else []))
+    assert [len(group.targets) for group in anchors] == (
+        [7] if views >= 8 else [views - 1] * (7 // (views - 1)) + ([1] if 7 % (views - 1) else [])
+    )
 
 
 def test_a_plan_among_all_captured_views_names_the_same_views() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from flows.jobs.job import Job, Request
 
 from cat3d_core.diffusion import SIZES, MultiViewModel, save_model
 from cat3d_core.generation import Cat3dGenerator
@@ -15,7 +16,6 @@ from flows.commands.run import make_config
 from flows.errors import InputError
 from flows.generation import open as opening
 from flows.generation.open import forget_generator, format_names, generator_spec, open_generator
-from flows.jobs.job import Job, Request
 from tests.flows.generation.package import code_of, install
 from tests.flows.workers.scene import SOURCE, random_model, run_of, run_stages
 
@@ -130,7 +130,9 @@ def test_a_generator_that_wants_images_gets_photos_and_decoded_anchors(
     """Of one photo: the anchors' group sees the photo, later groups also the anchors, as pictures."""
     code = code_of("your_own_generator.md").replace("nearest_view 1", "looks 1")
     code = code.replace("    cost=", '    wants=frozenset({"images"}),\n    cost=')
-    code = code.replace("for group in groups:", "for group in groups:\n            assert group.images.shape[0] == len(group.latents)")
+    code = code.replace(
+        "for group in groups:", "for group in groups:\n            assert group.images.shape[0] == len(group.latents)"
+    )
     code = code.replace("yield group.latents[", "yield 1 - group.images[")
     install(tmp_path / "site", monkeypatch, "looks", opening.GROUP, code)
     one = job(tmp_path, "sample.generator=looks", "execution.workers=1", split="1")

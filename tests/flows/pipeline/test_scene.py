@@ -209,8 +209,9 @@ def test_auto_generates_views_for_a_single_photo_only(tmp_path: Path) -> None:
 
 
 def test_the_sampler_is_the_runs_own_else_the_models_else_the_measured_default(tmp_path: Path) -> None:
-    from cat3d_core.diffusion import SIZES, MultiViewModel, save_model
     from flows.generation.model import PAPER_SAMPLER, SAMPLER_DEFAULT, sampler_settings
+
+    from cat3d_core.diffusion import SIZES, MultiViewModel, save_model
 
     advice = {"solver": "ddim", "nodes": "trailing", "steps": 4, "guidance": 1.0}
     for name, provenance in {"plain": {}, "advised": {"sampler": advice}}.items():

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from flows.generation.model import shared_model
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.diffusion import GuidanceConfig, SamplerConfig, sample
@@ -14,7 +15,6 @@ from cat3d_core.plan import PlanConfig, make_plan
 from cat3d_core.zipnerf import ReconstructConfig, Trainer, Views
 from flows.commands.run import make_config
 from flows.generation.groups import StoredPlan
-from flows.generation.model import shared_model
 from flows.media.images import to_uint8
 from flows.pipeline.jobs import Job, expected_steps, make_jobs
 from flows.reporting.inspect import inspect_store

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from flows.generation.model import sampler_config
+from flows.generation.shrinking import sample_at_most
 
 from flows.errors import WorkerError
 from flows.generation.groups import StoredPlan
-from flows.generation.model import sampler_config
-from flows.generation.shrinking import sample_at_most
 from flows.pipeline.jobs import Job, Step, expected_steps
 from flows.stages import sample as sample_stage
 from flows.stages.sample import alike, network_inputs, sample_work
@@ -175,8 +175,9 @@ def test_several_scenes_share_the_workers(scene, expected) -> None:
 
 def test_out_of_memory_halves_the_batch_and_gives_the_same_result(scene, monkeypatch) -> None:
     """The allocator's error is raised by hand where more than one group is evaluated; the rest is real."""
-    from flows.generation import shrinking
     from flows.generation.model import shared_model
+
+    from flows.generation import shrinking
 
     job = scene()
     store = SceneStore.open(job.store_path)
