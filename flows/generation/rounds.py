@@ -12,8 +12,6 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from schemas.decisions import chosen as decided
-from schemas.decisions import skipped
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.rays import Rays, image_rays
@@ -29,6 +27,8 @@ from flows.jobs.access import read_cameras, read_images, views_with_role
 from flows.jobs.device import device
 from flows.jobs.job import Job
 from flows.media.images import resize
+from schemas.decisions import chosen as decided
+from schemas.decisions import skipped
 from schemas.scene_store import SceneStore
 
 #: Share of the plan's groups in a round, and the least gain in PSNR of the held-out view that is worth another one.

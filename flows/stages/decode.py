@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from schemas.decisions import skipped
 
 from flows.generation.groups import view_keys
 from flows.generation.open import generator_spec, open_generator
@@ -15,6 +14,7 @@ from flows.jobs.job import Job, Outcome
 from flows.jobs.stage import Stage, generates
 from flows.workers.fan_out import fan_out
 from flows.workers.work import Work, is_done
+from schemas.decisions import skipped
 from schemas.scene_store import SceneStore
 
 
@@ -33,9 +33,8 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     sampled = np.flatnonzero(generated.read("done_latent").any(-1)).tolist()
     left_out = sorted(set(range(views)) - set(sampled))
     generated.mark_skipped("done_image", left_out)
-    decisions = (
-        [skipped(f"Skipped decoding {len(left_out)} of {views} views: they were not sampled.")] if left_out else []
-    )
+    text = f"Skipped decoding {len(left_out)} of {views} views: they were not sampled."
+    decisions = [skipped(text, views=len(left_out))] if left_out else []
     each = [[view] for view in range(views)]
     share = Work(
         job,

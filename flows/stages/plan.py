@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from schemas.decisions import chosen
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.plan import Plan, PlanConfig, make_plan
@@ -15,6 +14,7 @@ from flows.generation.plan import write_plan
 from flows.jobs.access import read_cameras, views_with_role
 from flows.jobs.job import Job, Outcome
 from flows.jobs.stage import Stage, generates, settings_of
+from schemas.decisions import chosen
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
 
@@ -39,7 +39,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     """Write `plan/` and its drawing `plan.png`."""
     run = store.run(job.run)
     train = views_with_role(store, run, "train")
-    plan = plan_run(job, store, train)
+    plan = planned(job, store, train)
     write_plan(run.plan, plan.among(train, store.captured.shape("size")[0]))
     from flows.reporting.plan_drawing import (
         draw_plan,  # matplotlib: a second, which asking what is to do should not cost
@@ -55,7 +55,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     return Outcome({"views": len(plan), "groups": len(plan.groups)}, decisions)
 
 
-def plan_run(job: Job, store: SceneStore, train: list[int]) -> Plan:
+def planned(job: Job, store: SceneStore, train: list[int]) -> Plan:
     """The plan from these captured views; its captured view i is train[i].
 
     Raises ConfigError for settings that contradict each other or the generator.

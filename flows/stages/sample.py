@@ -8,8 +8,6 @@ from dataclasses import replace
 from itertools import groupby
 from typing import Any
 
-from schemas.decisions import Decision, chosen, skipped
-
 from cat3d_core.diffusion import SamplerConfig
 from cat3d_core.generation import Cost, MemoryTooSmall
 from cat3d_core.plan import Group
@@ -22,6 +20,7 @@ from flows.jobs.job import Job, Outcome
 from flows.jobs.stage import Stage, generates, settings_of
 from flows.workers.fan_out import Totals, fan_out
 from flows.workers.work import Work, is_done
+from schemas.decisions import Decision, chosen, skipped
 from schemas.scene_store import SceneStore
 
 #: `skip.near_steps`: mean pose distance (scene distances, about radians of turning) from a group's views to the nearest
@@ -58,7 +57,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
             group_cost(job, plan.groups[g], group_sampler(job, plan, plan.groups[g])).evaluations for g in spared
         )
         text = f"{len(left_out)} of {len(plan)} planned views were left out; {saved} network evaluations were saved."
-        switch = "rounds" if plan.plan.needed else "covered_path"
+        switch = "rounds" if plan.needed else "covered_path"
         decisions.append(skipped(text, switch, views=len(left_out), evaluations=saved))
     decisions += rounds.decisions + sampler_decisions(job, plan, rounds.kept) + totals.decisions
     configs = [group_sampler(job, plan, plan.groups[g]) for g in groups]
@@ -76,7 +75,7 @@ def sample_work(job: Job, store: SceneStore, key: str, passes: Sequence[Sequence
     run.generated.create_array("latent", (len(plan), *generator_spec(job).latent_shape))
     run.generated.create_array("done_latent", (len(plan), 32))
     targets = [group.targets for group in plan.groups]
-    keys, passes = view_keys(key, len(plan)), plan.plan.passes() if passes is None else passes
+    keys, passes = view_keys(key, len(plan)), plan.passes() if passes is None else passes
     return Work(job, "sample", key, open_generator, work, run.generated, "done_latent", "latent", keys, passes, targets)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 
 import torch
-from schemas.decisions import Decision, chosen, skipped
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.zipnerf import Views
@@ -14,6 +13,7 @@ from flows.generation.views import generated_views
 from flows.jobs.access import read_cameras, read_images, views_with_role
 from flows.jobs.job import Job
 from flows.media.images import resize
+from schemas.decisions import Decision, chosen, skipped
 from schemas.scene_store import Run, SceneStore
 
 
