@@ -11,7 +11,7 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.uncertainty import shown_by
 from cat3d_core.zipnerf import PRESETS, Field, Trainer, Views, render_image
 from cat3d_core.zipnerf.render import Render
-from flows.generation.model import cpu_threads, device
+from flows.jobs.device import cpu_threads, device
 
 #: Captured views that have to show a place: what a single one shows may float anywhere before it.
 LEAST = 2

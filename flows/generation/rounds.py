@@ -21,11 +21,14 @@ from cat3d_core.zipnerf import Field, Views, stepfun
 from cat3d_core.zipnerf.render import render_rays
 from flows.generation.brief import brief_field, brief_render
 from flows.generation.groups import StoredPlan
-from flows.generation.model import device, shared_model
+from flows.generation.model import shared_model
+from flows.jobs.access import read_cameras, read_images, views_with_role
+from flows.jobs.device import device
+from flows.jobs.job import Job
 from flows.media.images import resize
-from flows.pipeline.jobs import Job
-from flows.stages.common import read_cameras, read_images, views_with_role
 from flows.stages.decode import decoded
+from schemas.decisions import chosen as decided
+from schemas.decisions import skipped
 from schemas.scene_store import SceneStore
 
 #: Share of the plan's groups in a round, and the least gain in PSNR of the held-out view that is worth another one.
@@ -43,7 +46,8 @@ class OneRound:
     def __init__(self, plan: StoredPlan) -> None:
         self.passes = plan.passes()
         self.kept = [g for items in self.passes for g in items]
-        self.decisions = [] if plan.needed else ["Sampled nothing: captured views cover the path."]
+        none = skipped("Sampled nothing: captured views cover the path.", "covered_path", views=len(plan))
+        self.decisions = [] if plan.needed else [none]
 
     def __iter__(self) -> Iterator[list[list[int]]]:
         yield self.passes
@@ -61,13 +65,12 @@ class Rounds(OneRound):
     def __iter__(self) -> Iterator[list[list[int]]]:
         if len(self.train) < 2 or not self.passes:
             if self.passes:
-                self.decisions.append("Sampled in one round: of one captured view none can be held out.")
+                self.decisions.append(decided("Sampled in one round: of one captured view none can be held out."))
             yield self.passes
             return
         if (1 - SHARE) * self.flops < BRIEF_FIELDS * BRIEF_FLOPS:
-            self.decisions.append(
-                "Sampled in one round: all groups cost less than the brief reconstructions that choosing takes."
-            )
+            text = "Sampled in one round: all groups cost less than the brief reconstructions that choosing takes."
+            self.decisions.append(decided(text))
             yield self.passes
             return
         *anchors, rest = self.passes
@@ -86,15 +89,16 @@ class Rounds(OneRound):
                 self.kept = sampled
             if after - before < GAIN_DB:
                 used = "" if after >= before else "; its views are not used"
-                self.decisions.append(f"{told}, which is less than {GAIN_DB:g} dB more{used}.")
+                self.decisions.append(decided(f"{told}, which is less than {GAIN_DB:g} dB more{used}."))
                 break
-            self.decisions.append(f"{told}.")
+            self.decisions.append(decided(f"{told}."))
             left = [g for g in rest if g not in self.kept]
             unknown = {g: self.unknown(field, g) for g in left}
             chosen = sorted(sorted(left, key=lambda g: (-unknown[g], g))[:size])
             anchors, before = [], after
         count = sum(map(len, self.passes))
-        self.decisions.append(f"{len(self.kept)} of {count} groups are used, chosen for this scene in {number} rounds.")
+        text = f"{len(self.kept)} of {count} groups are used, chosen for this scene in {number} rounds."
+        self.decisions.append(skipped(text, "rounds", groups=count - len(self.kept)))
 
     @property
     def held_out(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,13 @@ from cat3d_core.metrics.geometry import chamfer_distance
 from cat3d_core.metrics.perceptual import PerceptualDistance, find_perceptual, perceptual_name
 from cat3d_core.metrics.protocols import PROTOCOLS, evaluate
 from cat3d_core.synthetic.dataset import surface_points
-from flows.pipeline.jobs import Job, Outcome
+from flows.jobs.access import read_cameras, read_similarity, views_with_role
+from flows.jobs.job import Job, Outcome
+from flows.jobs.stage import Stage, settings_of
 from flows.progress import meter
-from flows.stages.common import read_cameras, read_similarity, views_with_role
+from flows.stages import render
+from schemas.content_key import content_key
+from schemas.decisions import skipped, warning
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
 from schemas.tables import METRICS, append_rows
@@ -30,10 +35,13 @@ RADIUS = 2.0
 SURFACE_POINTS = 4096
 
 
-def inputs(job: Job) -> dict[str, Any]:
-    """Which perceptual networks this machine has decides the LPIPS and CLIP columns."""
+def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
+    """Of the renders those of held-out views alone, so that a new path changes no number; which perceptual networks
+    this machine has, which decides the LPIPS and CLIP columns."""
     clip = find_clip()
+    test = {"views": job.view_names("test"), "rendered": job.config.render.test_views}
     return {
+        "render key": content_key(field=keys["reconstruct"], test=test, version=str(render.VERSION)),
         "perceptual": perceptual_name() if job.config.evaluate.lpips else None,
         "clip": clip.name if clip else None,
     }
@@ -51,10 +59,12 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     if test and job.config.render.test_views:
         perceptual = find_perceptual() if job.config.evaluate.lpips else None
         if perceptual is None:
-            decisions.append("No perceptual network on this machine, or lpips is off: the lpips column is empty.")
+            text = "No perceptual network on this machine, or lpips is off: the lpips column is empty."
+            decisions.append(warning(text))
         clip = find_clip()
         if clip is None:
-            decisions.append(f"No CLIP weights ({CLIP_VARIABLE} names a file of them): the clip_score column is empty.")
+            text = f"No CLIP weights ({CLIP_VARIABLE} names a file of them): the clip_score column is empty."
+            decisions.append(warning(text))
         renders = run.renders("test")
         names = store.captured.read("name")
         depths = job.capture().depths
@@ -71,7 +81,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
                     rows.append(common | view_row(protocol, image, truth, mask, perceptual))
                 progress.advance()
     else:
-        decisions.append("This run has no rendered held-out views: there is nothing to compare.")
+        decisions.append(skipped("This run has no rendered held-out views: there is nothing to compare."))
     append_rows(job.results_path / "metrics", METRICS, rows, f"{job.scene_id}.{job.run}")
     return Outcome({"views": len(test)}, decisions)
 
@@ -134,3 +144,6 @@ def _surface(depth: Tensor, camera: Cameras) -> Tensor:
     points = surface_points(depth[None], camera)
     points = points[points.norm(dim=-1) <= RADIUS]
     return points[:: max(1, -(-len(points) // SURFACE_POINTS))]
+
+
+STAGE = Stage("evaluate", execute, version=VERSION, reads=("render",), settings=settings_of("evaluate"), inputs=inputs)

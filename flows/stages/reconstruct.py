@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -13,13 +14,14 @@ from safetensors.torch import save_file
 
 from cat3d_core.metrics.perceptual import find_perceptual, perceptual_name
 from cat3d_core.zipnerf import PRESETS, Field, ReconstructConfig, Trainer, Views
-from flows.pipeline.jobs import Job, Outcome
+from flows.jobs.job import Job, Outcome
+from flows.jobs.stage import Stage, settings_of
 from flows.progress import meter
 from flows.stages.training_views import training_views
+from schemas.decisions import Decision, chosen, skipped, warning
 from schemas.errors import ConfigError
 from schemas.scene_store import Run, SceneStore
 
-VERSION = 5
 CHECKPOINT_INTERVAL_S = 20.0
 #: `skip.rays`: steps that see as many rays as there are pixels, at least, and the fewest rays of a step. With generated
 #: views, whose pixels are many and uncertain, a step does with this share of its rays if all steps together still see
@@ -55,7 +57,7 @@ def trainer_config(job: Job) -> ReconstructConfig:
     """
     settings = job.config.reconstruct
     config = PRESETS[settings.preset]
-    if job.config.method == "zipnerf":
+    if not job.generates:
         # The paper's baseline has no perceptual loss: captured views agree with each other. (Measured on llff_fern, 3
         # views, 101x76, 300 iterations of `fast`: 24.7 dB without, 18.9 dB with.)
         config = dataclasses.replace(config, lpips_weight=0.0)
@@ -82,13 +84,14 @@ def trainer_config(job: Job) -> ReconstructConfig:
         raise ConfigError(f"reconstruct.overrides: {error}") from None
 
 
-def inputs(job: Job) -> dict[str, Any]:
-    """The full trainer configuration, the LPIPS network, and the rules of `fitted`: a changed preset or rule makes old
-    fields stale."""
+def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
+    """The training views, the full trainer configuration, the LPIPS network, and the rules of `fitted`: a changed
+    preset or rule makes old fields stale."""
     config = trainer_config(job)
     perceptual = perceptual_name() if config.lpips_weight > 0 else None
     rays = [PASSES, FEWEST_RAYS, GENERATED_SHARE, LEAST_PASSES] if job.config.skip.rays else False
-    found: dict[str, Any] = {"trainer": dataclasses.asdict(config), "perceptual": perceptual, "rays": rays}
+    found: dict[str, Any] = {"train": job.view_names("train")}
+    found |= {"trainer": dataclasses.asdict(config), "perceptual": perceptual, "rays": rays}
     found |= {"detail": job.config.skip.detail, "seen": job.config.skip.seen}
     if job.config.skip.plateau:
         found["plateau"] = [FEW_VIEWS, PATIENT, GENERATED]
@@ -106,22 +109,20 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     if config.patch_size > smallest:
         config = dataclasses.replace(config, patch_size=smallest)
         if config.lpips_weight > 0:
-            decisions.append(f"LPIPS patches are {smallest} pixels, the shorter side of the smallest view.")
+            decisions.append(chosen(f"LPIPS patches are {smallest} pixels, the shorter side of the smallest view."))
     perceptual = find_perceptual() if config.lpips_weight > 0 else None
     if perceptual is None and config.lpips_weight > 0:
-        decisions.append("No perceptual network was found on this machine: trained without the LPIPS loss.")
+        decisions.append(warning("No perceptual network was found on this machine: trained without the LPIPS loss."))
     elif perceptual is not None and config.patch_size < perceptual.architecture.smallest:
-        decisions.append(
-            f"Trained without the LPIPS loss: {perceptual.name} needs patches of {perceptual.architecture.smallest} "
-            f"pixels, and these are {config.patch_size}."
-        )
+        text = f"Trained without the LPIPS loss: {perceptual.name} needs patches of {perceptual.architecture.smallest} "
+        decisions.append(warning(text + f"pixels, and these are {config.patch_size}."))
         perceptual = None
     device = "cuda" if torch.cuda.is_available() else "cpu"
     trainer = Trainer(config, views, job.config.seed, device, perceptual)
     checkpoint = Checkpoint(job, key)
     resumed = checkpoint.load(trainer)
     if resumed:
-        decisions.append(f"Went on from the checkpoint at iteration {trainer.iteration}.")
+        decisions.append(skipped(f"Went on from the checkpoint at iteration {resumed}.", steps=resumed))
     record = []
     saved = started = time.monotonic()
     with meter(f"reconstruct {job.scene_id} {job.run}", config.iterations) as progress:
@@ -135,14 +136,16 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
                 saved = time.monotonic()
     decisions += skip_decisions(trainer)
     if trainer.skipped:
-        decisions.append(f"{trainer.skipped} steps with a non-finite loss or gradient were skipped.")
+        decisions.append(warning(f"{trainer.skipped} steps with a non-finite loss or gradient were skipped."))
     write_field(run, trainer.field, record)
     checkpoint.remove()
     rays = (trainer.iteration - resumed) * config.batch_rays
     return Outcome({"views": len(views), "steps": trainer.iteration - resumed, "rays": rays}, decisions)
 
 
-def fitted(job: Job, config: ReconstructConfig, views: Views, seen: float = 0.0) -> tuple[ReconstructConfig, list[str]]:
+def fitted(
+    job: Job, config: ReconstructConfig, views: Views, seen: float = 0.0
+) -> tuple[ReconstructConfig, list[Decision]]:
     """The settings where they depend on what there is to train on, and why; overrides of the run stay. seen: share of
     the generated pixels that is left out, as captured views show it."""
     skip, captured = job.config.skip, int(views.captured.sum())
@@ -157,7 +160,8 @@ def fitted(job: Job, config: ReconstructConfig, views: Views, seen: float = 0.0)
     rays, why = enough_rays(config, int(views.counting.sum()), captured < len(views))
     if skip.rays and rays < config.batch_rays:
         changes |= {"batch_rays": rays}
-        decisions.append(f"{rays} instead of {config.batch_rays} rays a step: {why}.")
+        text = f"{rays} instead of {config.batch_rays} rays a step: {why}."
+        decisions.append(skipped(text, "rays", rays_a_step=config.batch_rays - rays))
     given = job.config.reconstruct.overrides
     return dataclasses.replace(config, **{n: v for n, v in changes.items() if n not in given}), decisions
 
@@ -173,22 +177,25 @@ def enough_rays(config: ReconstructConfig, pixels: int, generated: bool) -> tupl
     return most, "most pixels are generated"
 
 
-def skip_decisions(trainer: Trainer) -> list[str]:
+def skip_decisions(trainer: Trainer) -> list[Decision]:
     """What the training did without."""
-    config, steps, out = trainer.config, trainer.iteration, []
+    config, steps = trainer.config, trainer.iteration
+    out: list[Decision] = []
     if config.low_resolution_iterations:
-        out.append(f"Images of half the size in {min(steps, config.low_resolution_iterations)} of {steps} steps.")
+        coarse = min(steps, config.low_resolution_iterations)
+        out.append(skipped(f"Images of half the size in {coarse} of {steps} steps.", "low_resolution"))
     if config.proposal_every > 1:
-        out.append(f"Proposals were trained at every {config.proposal_every}th step after the warm-up.")
+        text = f"Proposals were trained at every {config.proposal_every}th step after the warm-up."
+        out.append(skipped(text, "proposals"))
     if config.lpips_every > 1 and trainer.perceptual is not None:
-        out.append(f"The LPIPS loss was taken in one of {config.lpips_every} steps.")
+        out.append(skipped(f"The LPIPS loss was taken in one of {config.lpips_every} steps.", "lpips"))
     if config.skip_transmittance:
-        out.append(f"The field was not asked where less than {config.skip_transmittance:g} of a ray's light is left.")
+        text = f"The field was not asked where less than {config.skip_transmittance:g} of a ray's light is left."
+        out.append(skipped(text, "empty_space"))
     if steps < config.iterations:
-        out.append(
-            f"Skipped {config.iterations - steps} of {config.iterations} steps: from step {trainer.plateau_at} on "
-            "held-out pixels no longer improved, and a cool-down ended the training."
-        )
+        text = f"Skipped {config.iterations - steps} of {config.iterations} steps: from step {trainer.plateau_at} on "
+        text += "held-out pixels no longer improved, and a cool-down ended the training."
+        out.append(skipped(text, "plateau", steps=config.iterations - steps))
     return out
 
 
@@ -239,3 +246,13 @@ class Checkpoint:
     def remove(self) -> None:
         """The stage is complete; the state is no longer needed."""
         self.path.unlink(missing_ok=True)
+
+
+STAGE = Stage(
+    "reconstruct",
+    execute,
+    version=5,
+    reads=("poses", "decode"),
+    settings=settings_of("reconstruct", "seed"),
+    inputs=inputs,
+)

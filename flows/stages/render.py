@@ -2,23 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import torch
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.trajectories import RECIPES, Shift, choose_recipe, scene_frame
 from cat3d_core.zipnerf import Field, render_image
+from flows.jobs.access import read_cameras, views_with_role, write_cameras
+from flows.jobs.job import Job, Outcome
+from flows.jobs.stage import Stage, settings_of
 from flows.media import images
 from flows.media.pictures import depth_picture
 from flows.media.video import write_video
-from flows.pipeline.jobs import Job, Outcome
 from flows.progress import Meter, meter
-from flows.stages.common import read_cameras, views_with_role, write_cameras
 from flows.stages.reconstruct import read_field
 from schemas.content_key import array_digest, content_key
+from schemas.decisions import skipped
 from schemas.scene_store import Run, SceneStore, Section
 
+#: Raised when the same field and cameras give other pictures.
 VERSION = 1
+
+
+def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
+    """The held-out views."""
+    return {"test": job.view_names("test")}
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
@@ -29,7 +40,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     test = views_with_role(store, run, "test") if settings.test_views else []
     captured = read_cameras(store.captured)
     jobs = [("test", captured[test], test)] if test else []
-    decisions = [] if test else ["No held-out views to render: this split has none."]
+    decisions = [] if test else [skipped("No held-out views to render: this split has none.")]
     if settings.path != "none":
         path = camera_path(job, store, run)
         jobs.append(("path", path, list(range(len(path)))))
@@ -40,7 +51,8 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
             made = render_views(run.renders(kind), field, cameras, views, _field_key(job, store), progress)
             rendered, rays = rendered + len(made), rays + sum(made)
     if rendered < total:
-        decisions.append(f"Skipped {total - rendered} of {total} renders: they are of this field and these cameras.")
+        text = f"Skipped {total - rendered} of {total} renders: they are of this field and these cameras."
+        decisions.append(skipped(text, views=total - rendered))
     write_pictures(job, run, test)
     return Outcome({"views": rendered, "rays": rays}, decisions)
 
@@ -119,3 +131,6 @@ def _depth_range(section: Section) -> tuple[float, float]:
     depth = section.read("depth")
     inside = depth[depth > 0]
     return tuple(np.quantile(inside, [0.01, 0.95]).tolist()) if inside.size else (0.1, 1.0)
+
+
+STAGE = Stage("render", execute, version=VERSION, reads=("reconstruct",), settings=settings_of("render"), inputs=inputs)

@@ -250,7 +250,9 @@ def test_clip_weights_make_only_the_evaluation_stale(root: Path, monkeypatch, pr
     out, run = root / "out", "v3-zipnerf"
     save_file(state, root / "clip.safetensors")
     assert all(row["clip_score"] is None for row in read_rows(out / "metrics", METRICS).to_pylist())
-    assert any("No CLIP weights" in d for d in SceneStore.open(out / "room.zarr").record("evaluate", run).decisions)
+    assert any(
+        "No CLIP weights" in d.text for d in SceneStore.open(out / "room.zarr").record("evaluate", run).decisions
+    )
     monkeypatch.setenv("CAT3D_CLIP_WEIGHTS", str(root / "clip.safetensors"))
     assert stale_of(out) == every(["evaluate"], ["evaluate"])
     redo(find_stale(out)[0])
