@@ -1,7 +1,7 @@
 """Writes the reference pages that follow from the code: commands, settings, store layout, sweeps and presets.
 
-    python -m infra.docs.reference            # write them
-    python -m infra.docs.reference --check    # exit code 1 where a page is not what the code says
+python -m infra.docs.reference            # write them
+python -m infra.docs.reference --check    # exit code 1 where a page is not what the code says
 """
 
 from __future__ import annotations
@@ -28,22 +28,29 @@ def commands() -> str:
     """Every command of `cat3d` with its arguments and options, from the command line's own help."""
     group = typer.main.get_command(app)
     lines = [NOTE.format(source="flows/cli.py"), "# Commands", ""]
-    lines += wrapped("What `cat3d COMMAND --help` says, on one page. Exit codes: 0 done, 1 something failed (a sentence "
-                     "says what, where, and what to do), 2 wrong usage.")  # fmt: skip
+    lines += wrapped(
+        "What `cat3d COMMAND --help` says, on one page. Exit codes: 0 done, 1 something failed (a sentence says what, "
+        "where, and what to do), 2 wrong usage."
+    )
     for name, command in sorted(getattr(group, "commands", {}).items()):
         usage = " ".join([name, *(_usage(p) for p in command.params if p.param_type_name == "argument")])
-        lines += ["", f"## cat3d {name}", "", *wrapped(_sentence(command.help)), "", f"    cat3d {usage} [OPTIONS]", ""]
+        lines += ["", f"## cat3d {name}", "", *wrapped(_sentence(command.help)), ""]
+        lines += [f"    cat3d {usage} [OPTIONS]", ""]
         for parameter in command.params:
             if parameter.name != "help":
-                lines += bullet(f"{_names(parameter)}: {_sentence(getattr(parameter, 'help', ''))}{_default(parameter)}")
+                lines += bullet(
+                    f"{_names(parameter)}: {_sentence(getattr(parameter, 'help', ''))}{_default(parameter)}"
+                )
     return "\n".join(lines) + "\n"
 
 
 def settings() -> str:
     """Every setting of a run, a sweep and a training with its default and meaning, from the schemas' docstrings."""
     lines = [NOTE.format(source="schemas/"), "# Settings", ""]
-    lines += wrapped("Every setting has a default. Give others in a file (`--config FILE.yaml`) or one at a time "
-                     "(`--set render.path_views=30`). Unknown names are refused.")  # fmt: skip
+    lines += wrapped(
+        "Every setting has a default. Give others in a file (`--config FILE.yaml`) or one at a time "
+        "(`--set render.path_views=30`). Unknown names are refused."
+    )
     for title, model in (("A run", RunConfig), ("A sweep", SweepConfig), ("A training", TrainRunConfig)):
         lines += ["", f"## {title}", ""]
         for prefix, section in _sections(model):
@@ -59,10 +66,12 @@ def settings() -> str:
 def store() -> str:
     """Every array of the scene store, from `schemas/layout.py`."""
     lines = [NOTE.format(source="schemas/layout.py"), "# The scene store", ""]
-    lines += wrapped("One Zarr v3 folder a scene. Each array carries the names of its dimensions, its unit and its "
-                     "meaning, so `xarray.open_zarr(STORE, group=\"captured\")` and `xarray.open_datatree(STORE)` open it. "
-                     "A view is one chunk, checked by crc32c when it is read; a content key or a record is written "
-                     "after the data, and says that they are complete.")  # fmt: skip
+    lines += wrapped(
+        "One Zarr v3 folder a scene. Each array carries the names of its dimensions, its unit and its meaning, so "
+        '`xarray.open_zarr(STORE, group="captured")` and `xarray.open_datatree(STORE)` open it. A view is one chunk, '
+        "checked by crc32c when it is read; a content key or a record is written after the data, and says that they "
+        "are complete."
+    )
     section = ""
     for spec in LAYOUT:
         above, _, name = spec.path.rpartition("/")
