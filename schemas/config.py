@@ -86,7 +86,7 @@ class SampleConfig(_Model):
     """
 
     generator: str | None = None
-    """Which generator: "cat3d" or the name of an installed package's (docs/your_own_generator.md); None: the one that
+    """Which generator: "cat3d" or the name of an installed package's (docs/guides/your_own_generator.md); None: the one that
     recognises the checkpoint."""
     checkpoint: Path | None = None
     """File or folder with the generator's weights; None: the ones shipped."""

@@ -27,8 +27,8 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def nearest_view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The package of docs/your_own_generator.md, installed; its name."""
-    install(tmp_path / "site", monkeypatch, "nearest_view", opening.GROUP, code_of("your_own_generator.md"))
+    """The package of docs/guides/your_own_generator.md, installed; its name."""
+    install(tmp_path / "site", monkeypatch, "nearest_view", opening.GROUP, code_of("guides/your_own_generator.md"))
     return "nearest_view"
 
 
@@ -128,7 +128,7 @@ def test_a_generator_that_wants_images_gets_photos_and_decoded_anchors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of one photo: the anchors' group sees the photo, later groups also the anchors, as pictures."""
-    code = code_of("your_own_generator.md").replace("nearest_view 1", "looks 1")
+    code = code_of("guides/your_own_generator.md").replace("nearest_view 1", "looks 1")
     code = code.replace("    cost=", '    wants=frozenset({"images"}),\n    cost=')
     code = code.replace(
         "for group in groups:", "for group in groups:\n            assert group.images.shape[0] == len(group.latents)"
