@@ -100,8 +100,8 @@ def model_problem(path: Path, groups: int = 2, given: int = 3) -> Problem:
         seen = reference_from_image(cameras, cameras.world_from_camera[0])
         noise = torch.stack([normal(latents.shape[1:], 0, number, v, "noise") for v in range(given, len(latents))])
         parts.append((latents[:given], seen, noise))
-    latents, cameras, noise = (torch.stack(part) for part in zip(*parts, strict=True))
-    return model, latents, cameras, noise
+    latents, seen, noise = (torch.stack(part) for part in zip(*parts, strict=True))
+    return model, latents, seen, noise
 
 
 def rows(
