@@ -11,7 +11,8 @@ import torch
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.normalization import Similarity
-from cat3d_core.zipnerf import Field, ReconstructConfig, Render, render_image
+from cat3d_core.reconstruction import Render
+from cat3d_core.zipnerf import Field, ZipNerfConfig, render_image
 from flows.errors import InputError
 from flows.progress import meter
 from flows.stages.common import read_cameras, read_images, read_similarity, views_with_role
@@ -59,7 +60,7 @@ def _read_field(store: SceneStore, run: Run) -> Field:
     state = {name: torch.from_numpy(run.field.read(name)) for name in run.field.attrs["parameters"]}
     try:
         values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
-        config = ReconstructConfig(**values)
+        config = ZipNerfConfig(**values)
         field = Field.from_state(config, state)
     except (TypeError, ValueError) as error:
         raise InputError(

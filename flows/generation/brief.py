@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
+from cat3d_core.reconstruction import Render, Views
 from cat3d_core.uncertainty import shown_by
-from cat3d_core.zipnerf import PRESETS, Field, Trainer, Views, render_image
-from cat3d_core.zipnerf.render import Render
+from cat3d_core.zipnerf import PRESETS, Field, Trainer, render_image
 from flows.generation.model import cpu_threads, device
 
 #: Captured views that have to show a place: what a single one shows may float anywhere before it.
@@ -40,7 +40,9 @@ def shown_by_captured(views: Views, seed: int, threads: int) -> Tensor:
     Where that place is says a field trained briefly on the captured views."""
     captured, generated = (torch.nonzero(chosen)[:, 0].tolist() for chosen in (views.captured, ~views.captured))
     known = views.cameras[captured]
-    field = brief_field(Views(known, [views.image(v) for v in captured], views.captured[captured]), seed, threads)
+    field = brief_field(
+        Views.from_images(known, [views.image(v) for v in captured], views.captured[captured]), seed, threads
+    )
     with cpu_threads(threads):
         depths = [brief_render(field, known, view).depth.cpu() for view in range(len(captured))]
         found = torch.zeros(len(views.pixels), dtype=torch.bool)

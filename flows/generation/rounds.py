@@ -15,9 +15,10 @@ import torch
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.rays import Rays, image_rays
+from cat3d_core.reconstruction import Views
 from cat3d_core.uncertainty import ray_entropy, unseen
 from cat3d_core.view_selection import pose_distance
-from cat3d_core.zipnerf import Field, Views, stepfun
+from cat3d_core.zipnerf import Field, stepfun
 from cat3d_core.zipnerf.render import render_rays
 from flows.generation.brief import brief_field, brief_render
 from flows.generation.groups import StoredPlan
@@ -114,7 +115,7 @@ class Rounds(OneRound):
             image = decoded(model, run.generated, view)[0, y0 : y0 + height, x0 : x0 + width]
             cameras = Cameras.cat([cameras, self.plan.cameras[view].crop(x0, y0, width, height)])
             images.append(torch.from_numpy(np.ascontiguousarray(image)))
-        return Views(cameras, images, torch.arange(len(cameras)) < len(shown))
+        return Views.from_images(cameras, images, torch.arange(len(cameras)) < len(shown))
 
     def brief_field(self, groups: list[int]) -> Field:
         """Of the captured views but the held-out one and the views of the groups."""

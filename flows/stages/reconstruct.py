@@ -12,7 +12,8 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from cat3d_core.metrics.perceptual import find_perceptual, perceptual_name
-from cat3d_core.zipnerf import PRESETS, Field, ReconstructConfig, Trainer, Views
+from cat3d_core.reconstruction import Views
+from cat3d_core.zipnerf import PRESETS, Field, Trainer, ZipNerfConfig
 from flows.pipeline.jobs import Job, Outcome
 from flows.progress import meter
 from flows.stages.training_views import training_views
@@ -48,7 +49,7 @@ def skip_settings(iterations: int) -> dict[str, dict[str, Any]]:
     }
 
 
-def trainer_config(job: Job) -> ReconstructConfig:
+def trainer_config(job: Job) -> ZipNerfConfig:
     """The preset with the method's and family's LPIPS weight, what the run skips, and its overrides.
 
     Raises ConfigError naming a bad setting.
@@ -62,13 +63,13 @@ def trainer_config(job: Job) -> ReconstructConfig:
     elif job.dataset in STRONG_LPIPS_DATASETS:
         config = dataclasses.replace(config, lpips_weight=STRONG_LPIPS * config.lpips_weight)
     iterations = settings.overrides.get("iterations", config.iterations)
-    off = ReconstructConfig()  # as in the paper: nothing is skipped
+    off = ZipNerfConfig()  # as in the paper: nothing is skipped
     for name, changes in skip_settings(iterations if isinstance(iterations, int) else config.iterations).items():
         on = getattr(job.config.skip, name)
         on = on and not (name == "low_resolution" and config.lpips_weight == 0)  # patches are all it saves
         chosen = {n: value if on else getattr(off, n) for n, value in changes.items()}
         config = dataclasses.replace(config, **chosen)
-    known = {f.name for f in dataclasses.fields(ReconstructConfig)}
+    known = {f.name for f in dataclasses.fields(ZipNerfConfig)}
     unknown = sorted(set(settings.overrides) - known)
     if unknown:
         raise ConfigError(
@@ -142,7 +143,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     return Outcome({"views": len(views), "steps": trainer.iteration - resumed, "rays": rays}, decisions)
 
 
-def fitted(job: Job, config: ReconstructConfig, views: Views, seen: float = 0.0) -> tuple[ReconstructConfig, list[str]]:
+def fitted(job: Job, config: ZipNerfConfig, views: Views, seen: float = 0.0) -> tuple[ZipNerfConfig, list[str]]:
     """The settings where they depend on what there is to train on, and why; overrides of the run stay. seen: share of
     the generated pixels that is left out, as captured views show it."""
     skip, captured = job.config.skip, int(views.captured.sum())
@@ -162,7 +163,7 @@ def fitted(job: Job, config: ReconstructConfig, views: Views, seen: float = 0.0)
     return dataclasses.replace(config, **{n: v for n, v in changes.items() if n not in given}), decisions
 
 
-def enough_rays(config: ReconstructConfig, pixels: int, generated: bool) -> tuple[int, str]:
+def enough_rays(config: ZipNerfConfig, pixels: int, generated: bool) -> tuple[int, str]:
     """Rays of a step that are enough for so many pixels, some of them generated or none, and why."""
     most = config.batch_rays
     if generated and config.iterations * GENERATED_SHARE * most >= LEAST_PASSES * pixels:

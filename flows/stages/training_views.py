@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.zipnerf import Views
+from cat3d_core.reconstruction import Views
 from flows.generation.brief import LEAST, shown_by_captured
 from flows.media.images import resize
 from flows.pipeline.jobs import Job
@@ -44,7 +44,7 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, float,
         if not made:
             decisions.append("Trained on captured views alone, without the LPIPS loss: no view was generated.")
     captured = torch.arange(len(cameras)) < len(train)
-    views, share, told = unseen_alone(job, Views(cameras, images, captured))
+    views, share, told = unseen_alone(job, Views.from_images(cameras, images, captured))
     return views, share, decisions + told
 
 

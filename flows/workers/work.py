@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from pydantic import BaseModel, ConfigDict
 
-from cat3d_core.zipnerf import NonFiniteError
+from cat3d_core.reconstruction import NonFiniteError
 from flows.errors import InputError, WorkerError
 from flows.generation.model import cpu_threads, shared_model
 from flows.pipeline.jobs import Job

@@ -11,7 +11,8 @@ import torch
 from cat3d_core.cameras import Cameras
 from cat3d_core.diffusion import GuidanceConfig, SamplerConfig, sample
 from cat3d_core.plan import PlanConfig, make_plan
-from cat3d_core.zipnerf import ReconstructConfig, Trainer, Views
+from cat3d_core.reconstruction import Views
+from cat3d_core.zipnerf import Trainer, ZipNerfConfig
 from flows.commands.run import make_config
 from flows.generation.groups import StoredPlan
 from flows.generation.model import shared_model
@@ -117,7 +118,9 @@ def test_without_skips_every_stage_is_the_plain_core_bit_for_bit(model: Path, tm
     assert len(made) == VIEWS
     cameras = Cameras.cat([captured, *(camera for camera, _ in made)])
     images = [*read_images(store.captured, train), *(image for _, image in made)]
-    trainer = Trainer(trainer_config(one), Views(cameras, images, torch.arange(len(cameras)) < 3), one.config.seed)
+    trainer = Trainer(
+        trainer_config(one), Views.from_images(cameras, images, torch.arange(len(cameras)) < 3), one.config.seed
+    )
     while not trainer.finished:
         trainer.step()
     for name, value in trainer.field.state_dict().items():
@@ -268,9 +271,11 @@ def test_training_fits_what_there_is_to_train_on(model: Path, tmp_path: Path) ->
         count, side = captured + generated, 32
         poses = torch.eye(4, dtype=torch.float64).expand(count, 4, 4)
         cameras = Cameras(torch.eye(3, dtype=torch.float64).expand(count, 3, 3), poses, torch.full((count, 2), side))
-        return Views(cameras, [torch.zeros(side, side, 3, dtype=torch.uint8)] * count, torch.arange(count) < captured)
+        return Views.from_images(
+            cameras, [torch.zeros(side, side, 3, dtype=torch.uint8)] * count, torch.arange(count) < captured
+        )
 
-    def chosen(given: Views, *settings: str) -> ReconstructConfig:
+    def chosen(given: Views, *settings: str) -> ZipNerfConfig:
         one = job(tmp_path, model, "reconstruct.overrides={}", *settings)
         return fitted(one, trainer_config(one), given)[0]
 
