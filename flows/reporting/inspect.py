@@ -20,10 +20,11 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from schemas import arrays
+from schemas.documents import nodes
 from schemas.errors import MissingError, StoreError
 from schemas.layout import SCENE_STAGES, STAGES
 from schemas.scene_store import SceneStore, Section
-from schemas.verify import Problem, nodes, orphans, run_of, verify
+from schemas.verify import Problem, orphans, run_of, verify
 
 #: Arrays whose content keys say how many views of a stage are done.
 MARKERS = {"encode": "latents/done_captured", "sample": "generated/done_latent", "decode": "generated/done_image"}
