@@ -132,8 +132,10 @@ class ExecutionConfig(_Model):
 class ReconstructConfig(_Model):
     """Fitting the field (paper, section 3.3)."""
 
-    preset: Literal["tiny", "fast", "balanced", "paper"] = "fast"
-    """Point on the measured front of quality against time."""
+    method: str = "zipnerf"
+    """Name of the reconstructor: zipnerf, or that of an installed package."""
+    preset: str = "fast"
+    """Point on the measured front of quality against time; zipnerf has tiny, fast, balanced and paper."""
     overrides: dict[str, Any] = Field(default_factory=dict)
     """Settings of the trainer that replace the preset's."""
 

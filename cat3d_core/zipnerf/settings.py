@@ -119,9 +119,8 @@ def fitted(
     rays, why = enough_rays(config, int(views.counting.sum()), captured < len(views))
     if skip.get("rays") and rays < config.batch_rays:
         changes |= {"batch_rays": rays}
-        saved = {"rays": float((config.batch_rays - rays) * config.iterations)}
         text = f"{rays} instead of {config.batch_rays} rays a step: {why}."
-        decisions.append(Decision("skipped", text, "rays", saved))
+        decisions.append(Decision("skipped", text, "rays", {"rays_a_step": config.batch_rays - rays}))
     kept = set(given)
     config = dataclasses.replace(config, **{n: v for n, v in changes.items() if n not in kept})
     smallest = int(views.size.min())

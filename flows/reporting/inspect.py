@@ -107,7 +107,7 @@ def stage_rows(store: SceneStore) -> list[dict[str, Any]]:
             record = store.record(stage, run)
             if record is not None:
                 row |= {"complete": True, **record.model_dump(include={"key", "finished_at", "seconds", "work"})}
-                row["decisions"] = record.decisions
+                row["decisions"] = [decision.text for decision in record.decisions]
         except MissingError:
             continue  # the run was removed meanwhile
         except StoreError as error:

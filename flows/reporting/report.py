@@ -105,7 +105,7 @@ def scene_section(out: Path, path: Path) -> dict[str, Any]:
             {
                 "name": name,
                 "views": view_pictures(store, run, truths) if "render" in records else [],
-                "decisions": {stage: record.decisions for stage, record in records.items() if record.decisions},
+                "decisions": {stage: [d.text for d in record.decisions] for stage, record in records.items()},
                 "codes": {stage: record.code_version for stage, record in records.items()},
                 "model": records["sample"].inputs.get("model", "") if "sample" in records else "",
                 "config": run.attrs.get("job", {}).get("config", {}),

@@ -24,7 +24,8 @@ SAMPLED_AHEAD = "sample_ahead"
 
 
 def summary_rows(out: Path, scene_id: str | None = None) -> list[dict[str, Any]]:
-    """One row per (scene, run, protocol): means over held-out views, the seconds of the run's stages, and by which networks."""
+    """One row per (scene, run, protocol): means over held-out views and the networks that measured, the seconds of the
+    run's stages."""
     metrics = read_rows(out / "metrics", metric_table()).to_pylist()
     seconds = {(t["scene_id"], t["run"]): t["total"] for t in timing_rows(out)}
     groups: dict[tuple[str, str, str], list[dict[str, Any]]] = defaultdict(list)
@@ -189,8 +190,8 @@ def markdown(rows: Sequence[dict[str, Any]], tables: Sequence[dict[str, Any]]) -
     for table in tables:
         columns = ["data set", "method", "what", *(f"{s} views" for s in table["splits"])]
         lines += [
-            f"{' / '.join(map(title, paper_metrics()))}, protocol {table['protocol']}. In italics: the paper's, of other scenes and "
-            "sizes, LPIPS by another network.",
+            f"{' / '.join(map(title, paper_metrics()))}, protocol {table['protocol']}. In italics: the paper's, of "
+            "other scenes and sizes, LPIPS by another network.",
             "",
             _line(columns),
             "|" + "---|" * len(columns),

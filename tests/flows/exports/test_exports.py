@@ -36,7 +36,7 @@ from flows.exports.path import read_path
 from flows.exports.ply import write_ply
 from flows.exports.source import open_source, training_images
 from flows.media.images import read_image
-from flows.pipeline.scene import ensure_store, execute_stage, prepare_run
+from flows.pipeline.runner import opened, run_missing
 from flows.readers import read_capture
 from schemas.scene_store import SceneStore
 
@@ -262,16 +262,13 @@ OVERRIDES = (
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with a field and a rendered path, made without a server."""
-    from flows.pipeline.jobs import expected_steps, make_jobs
+    from flows.jobs.job import Request
 
     out = tmp_path_factory.mktemp("exports")
     config = make_config({"method": "zipnerf", "preset": "fast"}, None, [OVERRIDES, "render.path_views=2"])
-    capture, [job] = make_jobs("procedural:co3d/1?views=10&width=32&height=24", out, ["all"], config)
-    ensure_store(job, capture)
-    prepare_run(job, capture)
-    steps = expected_steps(job, capture)
-    for stage in ("ingest", "poses", "reconstruct", "render"):
-        execute_stage(job, steps[stage])
+    [job] = Request("procedural:co3d/1?views=10&width=32&height=24", out, ("all",), config).jobs()
+    with opened(job):
+        run_missing(job, until="render")
     return job.store_path
 
 
