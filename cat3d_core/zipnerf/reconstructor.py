@@ -11,7 +11,7 @@ from torch import Tensor
 from cat3d_core.cameras import Cameras
 from cat3d_core.decision import Decision
 from cat3d_core.metrics.perceptual import PerceptualDistance, find_perceptual, perceptual_name
-from cat3d_core.reconstruction.protocol import ReconstructionRequest
+from cat3d_core.reconstruction.protocol import ReconstructionRequest, Reconstructor
 from cat3d_core.reconstruction.render import Render
 from cat3d_core.reconstruction.views import Views
 from cat3d_core.zipnerf.config import PRESETS, ZipNerfConfig
@@ -98,6 +98,9 @@ class ZipNerf:
 
     def uncertainty(self, cameras: Cameras, index: int) -> Tensor:
         return render_uncertainty(self.field, cameras.to(dtype=torch.float32), index)
+
+
+_: type[Reconstructor] = ZipNerf  # for the type checker: it keeps the protocol
 
 
 def _perceptual(config: ZipNerfConfig) -> tuple[PerceptualDistance | None, list[Decision]]:
