@@ -45,7 +45,8 @@ class ReconstructionRequest:
 class Reconstructor(Protocol):
     """A way to turn posed views into something that renders. Lengths are in units of the normalised scene."""
 
-    #: Names of the presets, the quickest first; that one makes the brief reconstructions by which views are chosen.
+    #: Names of the presets, the quickest first; that one makes the brief reconstructions by which views are chosen. One
+    #: is "fast", which is asked for where the user names none.
     presets: ClassVar[tuple[str, ...]]
     #: Everything that can change the result, as JSON values: part of the stage's content key, and stored beside the
     #: tensors.

@@ -118,20 +118,6 @@ def curves(
     return rows
 
 
-def few_view(
-    preset: str = "fast", family: str = "mip360", counts: Sequence[int] = (3, 6, 9), test: int = 4, size: int = 64
-) -> list[dict[str, Any]]:
-    """Held-out quality from few captured views of a procedural scene."""
-    views, held, depths = procedural_views(family, max(counts) * 3, test, size, size)
-    rows = []
-    for count in counts:
-        keep = [round(i * (len(views) - 1) / (count - 1)) for i in range(count)]
-        images = [views.pixels[int(views.offset[i]) :][: size * size].view(size, size, 3) for i in keep]
-        some = Views.from_images(views.cameras[keep], images, views.captured[keep])
-        rows.append({"family": family, "views": count} | train_and_measure(PRESETS[preset], some, held, depths))
-    return rows
-
-
 def _kernels(device: str) -> dict[str, Query]:
     found: dict[str, Query] = {"torch reference": query_reference}
     if device == "cpu" and hash_grid_cpu.available():
