@@ -1,7 +1,7 @@
 """A job's generator: which kind it is, what it is like, and one loaded copy of it in each process.
 
 The only place that knows kinds of model files. A package of someone else's brings one through an entry point of the
-group `cat3d.generators` (docs/guides/your_own_generator.md).
+group `cat3d.generators` (docs/guides/own_generator.md).
 """
 
 from __future__ import annotations

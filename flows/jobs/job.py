@@ -8,11 +8,13 @@ from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, PrivateAttr
 
+from cat3d_core.diffusion.solvers import check_solver
 from flows.errors import InputError
 from flows.jobs.scene import Scene
 from flows.readers.base import Capture
 from schemas.config import RunConfig
 from schemas.decisions import Decision
+from schemas.errors import ConfigError
 
 
 class Job(BaseModel):
@@ -123,8 +125,13 @@ class Request:
     def jobs(self, scene: Scene | None = None) -> list[Job]:
         """A job for each split, with `method: auto` decided. scene: where that was read already.
 
-        Raises InputError for bad input, SplitError for an unknown split.
+        Raises InputError for bad input, SplitError for an unknown split, ConfigError for an unknown solver.
         """
+        if self.config.sample.solver is not None:
+            try:  # solvers are registered in the core, which the schemas do not see
+                check_solver(self.config.sample.solver)
+            except ValueError as error:
+                raise ConfigError(f"sample.solver: {error}") from None
         scene = scene or Scene(str(self.source), self.reader, self.image_folder)
         jobs = []
         for split in self.views:

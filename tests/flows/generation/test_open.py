@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from flows.jobs.job import Job, Request
 
 from cat3d_core.diffusion import SIZES, MultiViewModel, save_model
 from cat3d_core.generation import Cat3dGenerator
@@ -16,7 +15,8 @@ from flows.commands.run import make_config
 from flows.errors import InputError
 from flows.generation import open as opening
 from flows.generation.open import forget_generator, format_names, generator_spec, open_generator
-from tests.flows.generation.package import code_of, install
+from flows.jobs.job import Job, Request
+from tests.flows.packages import code_of, install, install_guide
 from tests.flows.workers.scene import SOURCE, random_model, run_of, run_stages
 
 
@@ -27,9 +27,8 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def nearest_view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The package of docs/guides/your_own_generator.md, installed; its name."""
-    install(tmp_path / "site", monkeypatch, "nearest_view", opening.GROUP, code_of("guides/your_own_generator.md"))
-    return "nearest_view"
+    """The package of docs/guides/own_generator.md, installed; its name."""
+    return install_guide(tmp_path / "site", monkeypatch, "own_generator.md", opening.GROUP)
 
 
 def job(out: Path, *settings: str, split: str = "3") -> Job:
@@ -128,13 +127,13 @@ def test_a_generator_that_wants_images_gets_photos_and_decoded_anchors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of one photo: the anchors' group sees the photo, later groups also the anchors, as pictures."""
-    code = code_of("guides/your_own_generator.md").replace("nearest_view 1", "looks 1")
+    code = code_of("own_generator.md").replace("nearest_view 1", "looks 1")
     code = code.replace("    cost=", '    wants=frozenset({"images"}),\n    cost=')
     code = code.replace(
         "for group in groups:", "for group in groups:\n            assert group.images.shape[0] == len(group.latents)"
     )
     code = code.replace("yield group.latents[", "yield 1 - group.images[")
-    install(tmp_path / "site", monkeypatch, "looks", opening.GROUP, code)
+    install(tmp_path / "site", monkeypatch, opening.GROUP, ("looks", "looks"), code)
     one = job(tmp_path, "sample.generator=looks", "execution.workers=1", split="1")
     run_stages(one, "ingest", "poses", "plan", "encode", "sample", "decode")
     images = run_of(one).generated.read("image")
