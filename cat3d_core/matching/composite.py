@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from dataclasses import dataclass
 
 import torch
@@ -22,3 +24,12 @@ class Composite:
     def __call__(self, colour: Tensor, confidence: Tensor, sample: Tensor) -> Tensor:
         """colour and sample (N, 3, H, W), confidence (N, H, W) -> (N, 3, H, W)."""
         return sample + self.share(confidence)[:, None] * (colour - sample)
+
+    def to_json(self) -> str:
+        """As one line of JSON."""
+        return json.dumps(dataclasses.asdict(self))
+
+    @staticmethod
+    def from_json(text: str) -> Composite:
+        """What `to_json` wrote."""
+        return Composite(**json.loads(text))

@@ -44,7 +44,9 @@ def observe(network: SweepNetwork, image: Tensor, cameras: Cameras) -> Observed:
     image (M, 3, H, W) in [0, 1], sides divisible by 16; cameras: M, of the normalised scene, of that size.
     Raises ValueError for sides that 16 does not divide, or cameras that do not fit the photos."""
     if len(image) == 0 or len(image) != len(cameras):
-        raise ValueError(f"{len(image)} photos come with {len(cameras)} cameras; each photo needs one, and there has to be one.")
+        raise ValueError(
+            f"{len(image)} photos come with {len(cameras)} cameras; each photo needs one, and there has to be one."
+        )
     _side(image.shape[-1], image.shape[-2])
     device = network.target.score.weight.device
     seen = views(cameras.to(device))

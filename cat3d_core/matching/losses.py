@@ -15,7 +15,9 @@ from cat3d_core.matching.planes import position_of, soft_assignment
 from cat3d_core.matching.warp import Views, pair_maps, project, take
 
 #: Weights of the terms of `losses`.
-WEIGHTS = {"colour": 1.0, "blended": 0.7, "planes": 0.1, "depth": 1.0, "photo_planes": 0.1, "photo_depth": 0.05, "sure": 0.2}  # fmt: skip
+WEIGHTS = {
+    "colour": 1.0, "blended": 0.7, "planes": 0.1, "depth": 1.0, "photo_planes": 0.1, "photo_depth": 0.05, "sure": 0.2,
+}  # fmt: skip
 # Mean absolute error of colour at which the confidence aimed at has fallen to 1 / e.
 _TOLERANCE = 0.06
 # Depths that differ by this share, plus this much inverse depth, are the same surface.
@@ -60,9 +62,7 @@ def losses(out: Swept, observed: Observed, batch: SweepBatch, nearest: float) ->
     photo_truth = position_of(batch.inverse_depth, nearest).clamp(max=1)
     logits = observed.logits
     photo_assigned = F.avg_pool2d(soft_assignment(photo_truth, logits.shape[1]), 4)
-    position, log_spread = (
-        enlarge(x, photo_truth[:, None])[:, 0] for x in (observed.position, observed.log_spread)
-    )
+    position, log_spread = (enlarge(x, photo_truth[:, None])[:, 0] for x in (observed.position, observed.log_spread))
     label = torch.exp(-(out.colour.detach() - truth).abs().mean(1, keepdim=True) / _TOLERANCE)
     return {
         "colour": (out.colour - truth).abs().mean() + 0.25 * dissimilarity(out.colour, truth),

@@ -8,8 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from cat3d_core.matching.composite import Composite
 from cat3d_core.matching.config import SweepConfig
-from cat3d_core.matching.layers import Residual, UNet, conv, resized
+from cat3d_core.matching.layers import UNet, conv, resized
 from cat3d_core.matching.photos import Encoder, Observed, PhotoDepth
 from cat3d_core.matching.planes import inverse_depth_of
 from cat3d_core.matching.targets import TargetDepth
@@ -59,16 +60,19 @@ class Finish(nn.Module):
 
 
 class SweepNetwork(nn.Module):
-    """One network for every number of photos (paper-free part of this project; `docs/model_card.md`)."""
+    """One network for every number of photos. The paper has no such step; the model card says what it is worth.
+
+    composite: how its pictures are put together with a sample of the diffusion model."""
 
     def __init__(self, config: SweepConfig | None = None) -> None:
         super().__init__()
-        self.config = config or SweepConfig()
+        self.config, self.composite = config or SweepConfig(), Composite()
         self.encoder, self.photo = Encoder(self.config), PhotoDepth(self.config)
         self.target, self.finish = TargetDepth(self.config), Finish(self.config, 9)
 
     def observe(self, image: Tensor, views: Views, partners: Tensor) -> Observed:
-        """Photos (B, 3, H, W) in [0, 1], sides divisible by 16; partners (B, P): see `partners`. Once for all targets."""
+        """Look at the photos once for all targets: (B, 3, H, W) in [0, 1], sides divisible by 16; partners (B, P): see
+        the function `partners`."""
         half, context, coarse, fine = self.encoder(image)
         position, log_spread, logits = self.photo(half, context, coarse, views, partners)
         return Observed(image, views, coarse.float(), fine.float(), position, log_spread, logits)
@@ -95,7 +99,8 @@ class SweepNetwork(nn.Module):
         hints = torch.cat(
             [
                 probability.amax(1, keepdim=True) * 2 - 1, entropy(probability) / 0.9 - 1, seen * 2 - 1, spread * 8 - 1,
-                disagreement(by_photo, weight) * 8, (trust.clamp(max=5).exp() * blend).sum((1, 2))[:, None].clamp(max=3),
+                disagreement(by_photo, weight) * 8,
+                (trust.clamp(max=5).exp() * blend).sum((1, 2))[:, None].clamp(max=3),
                 resized(coarse.softmax(1).amax(1, keepdim=True), height, width) * 3 - 1,
                 (at.valid * probability[:, None]).sum(2).mean(1, keepdim=True) * 2 - 1, mean * 2 - 1,
             ], 1,

@@ -118,7 +118,9 @@ class TargetDepth(nn.Module):
         spread = share - share.mean(1, keepdim=True)
         fine, hidden = self.fine(found, torch.stack([density.log() * 0.3, spread * 8], -1))
         fine = self.settle(fine + self._read(volume, share).to(fine.dtype))
-        out = F.pixel_shuffle(self.finer(fine).float().transpose(1, 2).flatten(0, 1), 2).unflatten(0, (n, count))[:, :, 0]
+        out = F.pixel_shuffle(self.finer(fine).float().transpose(1, 2).flatten(0, 1), 2).unflatten(0, (n, count))[
+            :, :, 0
+        ]
         own = fine.permute(0, 2, 3, 4, 1)[:, None].expand(*hidden.shape[:-1], -1)
         trust = self.trust(torch.cat([hidden, own.to(hidden.dtype)], -1))[..., 0].float() + found.agreement
         return logits, share, out, trust

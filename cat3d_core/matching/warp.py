@@ -62,10 +62,12 @@ def pair_maps(target: Views, photos: Views, dtype: torch.dtype = torch.float32) 
     return Maps(turn.to(dtype), shift.to(dtype), relative[..., :3, 3].norm(dim=-1).to(dtype))
 
 
-def pixel_grid(height: int, width: int, device: torch.device | None = None) -> Tensor:
+def pixel_grid(
+    height: int, width: int, device: torch.device | None = None, dtype: torch.dtype = torch.float32
+) -> Tensor:
     """(2, height, width) normalised coordinates x, y of the pixels' centres."""
-    y = (torch.arange(height, device=device) + 0.5) / height * 2 - 1
-    x = (torch.arange(width, device=device) + 0.5) / width * 2 - 1
+    y = (torch.arange(height, device=device, dtype=dtype) + 0.5) / height * 2 - 1
+    x = (torch.arange(width, device=device, dtype=dtype) + 0.5) / width * 2 - 1
     return torch.stack([x.expand(height, width), y[:, None].expand(height, width)])
 
 
@@ -82,7 +84,7 @@ def project(maps: Maps, inverse_depth: Tensor) -> Projected:
     """inverse_depth (N, K, h, w), >= 0: hypotheses at the pixels of N targets -> their places in M photos each."""
     n, count, h, w = inverse_depth.shape
     m = maps.turn.shape[1]
-    xy = pixel_grid(h, w, inverse_depth.device).to(inverse_depth.dtype).reshape(2, -1)
+    xy = pixel_grid(h, w, inverse_depth.device, inverse_depth.dtype).reshape(2, -1)
     ray = maps.turn[..., :2] @ xy + maps.turn[..., 2:]  # (N, M, 3, h * w)
     d = inverse_depth.reshape(n, 1, count, h * w)
     x, y, z = (ray[:, :, i, None] + maps.shift[:, :, i, None, None] * d for i in range(3))

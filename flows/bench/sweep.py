@@ -33,7 +33,13 @@ from cat3d_core.metrics.ssim import ssim
 from cat3d_core.synthetic import FAMILIES
 from cat3d_core.weights import default_model_path
 from flows.bench.model import (
-    ALL_CAPTURED, FEW_STEPS, captured_group, captured_scenes, evaluate_group, held_out_group, warped,
+    ALL_CAPTURED,
+    FEW_STEPS,
+    captured_group,
+    captured_scenes,
+    evaluate_group,
+    held_out_group,
+    warped,
 )  # fmt: skip
 from flows.training.renders import save
 
@@ -176,7 +182,11 @@ def table(rows: list[dict[str, Any]], perceptual: str | None) -> str:
             cells = []
             for method in METHODS:
                 r = at.get((label, given, method))
-                cells.append("" if r is None else f"{r['psnr']:.2f} / {r['ssim']:.2f}" + (f" / {r[perceptual]:.2f}" if perceptual else ""))
+                cells.append(
+                    ""
+                    if r is None
+                    else f"{r['psnr']:.2f} / {r['ssim']:.2f}" + (f" / {r[perceptual]:.2f}" if perceptual else "")
+                )
             lines.append(f"| {given} | {label} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 

@@ -154,7 +154,9 @@ def batch(
         if len(raw["image"]) >= photos + targets:
             scene = augmented(prepared(chosen(raw, photos + targets, spread, random), size, random), random)
             given = photographed(scene.image[:photos], random)
-            parts.append(Scene(torch.cat([given, scene.image[photos:]]), scene.inverse_depth, misplaced(scene.views, random)))
+            parts.append(
+                Scene(torch.cat([given, scene.image[photos:]]), scene.inverse_depth, misplaced(scene.views, random))
+            )
     return collated(parts, photos)
 
 
@@ -162,7 +164,9 @@ def collated(parts: Sequence[Scene], photos: int, at_most: int = 3) -> SweepBatc
     """Scenes of as many views each; the first `photos` are given, each with `at_most` partners."""
     given, wanted = slice(0, photos), slice(photos, None)
     own = [partners(part.views.pose[given], at_most) + i * photos for i, part in enumerate(parts)]
-    rows = torch.cat([(torch.arange(photos) + i * photos).repeat(len(p.image) - photos, 1) for i, p in enumerate(parts)])
+    rows = torch.cat(
+        [(torch.arange(photos) + i * photos).repeat(len(p.image) - photos, 1) for i, p in enumerate(parts)]
+    )
 
     def joined(which: slice) -> tuple[Tensor, Tensor, Views]:
         k, pose = torch.cat([p.views.k[which] for p in parts]), torch.cat([p.views.pose[which] for p in parts])
