@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -16,7 +17,7 @@ from cat3d_core.matching.warp import Views, pair_maps, project, take
 
 #: Weights of the terms of `losses`.
 WEIGHTS = {
-    "colour": 1.0, "blended": 0.7, "planes": 0.1, "depth": 1.0, "photo_planes": 0.1, "photo_depth": 0.05, "sure": 0.2,
+    "colour": 1.0, "blended": 0.7, "planes": 0.1, "depth": 1.0, "photo_planes": 0.2, "photo_depth": 0.1, "sure": 0.2,
 }  # fmt: skip
 # Mean absolute error of colour at which the confidence aimed at has fallen to 1 / e.
 _TOLERANCE = 0.06
@@ -38,6 +39,11 @@ class SweepBatch:
     target: Views
     truth: Tensor
     truth_depth: Tensor
+
+    def to(self, device: torch.device | str) -> SweepBatch:
+        """The batch on another device."""
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return SweepBatch(**{name: value.to(device) for name, value in values.items()})
 
 
 def visible(batch: SweepBatch) -> Tensor:

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from cat3d_core.matching.config import SweepConfig
-from cat3d_core.matching.layers import Residual, UNet, conv, enlarge
+from cat3d_core.matching.layers import Residual, UNet, conv, resized
 from cat3d_core.matching.planes import inverse_depth_of, local_mean
 from cat3d_core.matching.warp import Views, pair_maps, project, take
 
@@ -94,9 +94,9 @@ class PhotoDepth(nn.Module):
         entropy = -(probability * (probability + 1e-6).log()).sum(1, keepdim=True)
         peak = (volume * probability[:, None].to(volume.dtype)).sum(2)
         hints = torch.cat([peak.float(), mode, mean, entropy / 3, probability.amax(1, keepdim=True)], 1)
-        up = F.interpolate(hints, half.shape[-2:], mode="bilinear", align_corners=False)
+        up = resized(hints, *half.shape[-2:])
         change, spread = self.finer(torch.cat([half, up.to(half.dtype)], 1)).float().chunk(2, 1)
-        position = (enlarge(mode, half) + 0.1 * change).clamp(0, 1)
+        position = (resized(mode, *half.shape[-2:]) + 0.1 * change).clamp(0, 1)
         return position, (spread - 3).clamp(*_SPREAD), logits
 
     def _matched(self, coarse: Tensor, views: Views, partners: Tensor, h: int, w: int) -> tuple[Tensor, Tensor]:

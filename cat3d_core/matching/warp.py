@@ -33,6 +33,10 @@ class Views:
         """The views of some rows."""
         return Views(self.k[index], self.pose[index])
 
+    def to(self, device: torch.device | str) -> Views:
+        """The views on another device."""
+        return Views(self.k.to(device), self.pose.to(device))
+
 
 def views(cameras: Cameras) -> Views:
     """N cameras of any sizes -> k (N, 3, 3), pose (N, 4, 4), float64."""

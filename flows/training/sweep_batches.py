@@ -49,6 +49,10 @@ class GeometryBank:
                 out.append(part)
         return out
 
+    def named(self) -> list[str]:
+        """The names of the folders that have scenes, in the order of `sources`."""
+        return [folder.name for folder in self.folders if any(p.parent.parent == folder for p in self._loaded)]
+
     def draw(self, random: torch.Generator) -> dict[str, Tensor]:
         """image, inverse_depth, intrinsics and world_from_camera of one scene."""
         sources = self.sources()
