@@ -78,6 +78,19 @@ class PlanConfig(_Model):
     """Add the wide samples from padded squares for photos that aren't square."""
 
 
+class HintsConfig(_Model):
+    """What the photos show of the planned views, carried there by geometry before anything is sampled.
+
+    A plane sweep finds for each pixel of a planned view its depth, its colour in the photos and how far that is to be
+    trusted. The paper has no such step (docs/explanation/geometry.md).
+    """
+
+    use: Literal["auto", "always", "never"] = "auto"
+    """`auto`: with the shipped model, which was measured with them; other models go without."""
+    checkpoint: Path | None = None
+    """Weights of the plane sweep; None: the ones shipped."""
+
+
 class SampleConfig(_Model):
     """Sampling views from the diffusion model (paper, section 3.1).
 
@@ -179,6 +192,7 @@ class RunConfig(_Model):
     ingest: IngestConfig = Field(default_factory=IngestConfig)
     poses: PosesConfig = Field(default_factory=PosesConfig)
     plan: PlanConfig = Field(default_factory=PlanConfig)
+    hints: HintsConfig = Field(default_factory=HintsConfig)
     sample: SampleConfig = Field(default_factory=SampleConfig)
     reconstruct: ReconstructConfig = Field(default_factory=ReconstructConfig)
     render: RenderConfig = Field(default_factory=RenderConfig)

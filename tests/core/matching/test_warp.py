@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from flows.bench.model import held_out_group, warped
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -11,7 +12,6 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.matching.warp import pair_maps, pixel_grid, project, take, views
 from cat3d_core.metrics.psnr import psnr
 from cat3d_core.rays import image_rays
-from flows.bench.model import held_out_group, warped
 from tests.core.strategies import orbit, seeds
 
 WIDTH, HEIGHT = 24, 16
