@@ -87,7 +87,7 @@ def demo_command(out: Path, smallest: bool) -> None:
 def make_config(given: dict[str, Any], config_file: Path | None, settings: Sequence[str]) -> RunConfig:
     """The run's configuration: file, then --set, then options that differ from their defaults."""
     document = load_config(config_file).model_dump(mode="json") if config_file else {}
-    defaults = RunConfig().model_dump(mode="json")
+    defaults = RunConfig().model_dump(mode="json") | {"method": "auto"}
     for name, value in given.items():
         path = OPTION_FIELDS[name]
         if config_file is None or value != value_at(defaults, path):

@@ -43,12 +43,14 @@ class Job(BaseModel):
     @property
     def label(self) -> str:
         """The method's name, or that of the ablation."""
-        return self.config.label or self.config.method
+        method = self.config.reconstruct.method
+        generating = "cat3d" if method == "zipnerf" else f"cat3d-{method}"
+        return self.config.label or (generating if self.generates else method)
 
     @property
     def generates(self) -> bool:
         """Whether views are generated."""
-        return self.config.method != "zipnerf"
+        return self.config.generate != "never"
 
     @property
     def run(self) -> str:
@@ -121,7 +123,7 @@ class Request:
     image_folder: str | None = None
 
     def jobs(self, scene: Scene | None = None) -> list[Job]:
-        """A job for each split, with `method: auto` decided. scene: where that was read already.
+        """A job for each split, with `generate: auto` decided. scene: where that was read already.
 
         Raises InputError for bad input, SplitError for an unknown split.
         """
@@ -139,8 +141,8 @@ class Request:
                 config=config,
             ).sharing(scene)
             few = len(job.split["train"]) == 1
-            if config.method == "auto":
-                config = config.model_copy(update={"method": "cat3d" if few else "zipnerf"})
+            if config.generate == "auto":
+                config = config.model_copy(update={"generate": "always" if few else "never"})
                 job = job.model_copy(update={"config": config})
             jobs.append(job)
         return jobs

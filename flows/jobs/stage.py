@@ -6,7 +6,7 @@ list `STAGES` of `flows/stages/__init__.py`. Nothing else knows the stages.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -60,12 +60,19 @@ class Stage:
     passing: bool = False
 
 
-def settings_of(name: str, *others: str, without: tuple[str, ...] = ()) -> Callable[[RunConfig], dict[str, Any]]:
-    """Settings of a stage: the section `name` of the configuration but for `without`, and `others` beside it."""
+def settings_of(
+    name: str, *others: str, without: Sequence[str] = (), unless: Mapping[str, Any] | None = None
+) -> Callable[[RunConfig], dict[str, Any]]:
+    """Settings of a stage: the section `name` of the configuration but for the fields `without`, and `others` beside it.
+
+    unless: fields that are left out where they have this value; results from before there was the field stay valid.
+    """
+    left_out = dict(unless or {})
 
     def settings(config: RunConfig) -> dict[str, Any]:
         document = config.model_dump(mode="json")
         own = {field: value for field, value in document[name].items() if field not in without}
+        own = {field: value for field, value in own.items() if field not in left_out or left_out[field] != value}
         return own | {field: document[field] for field in others}
 
     return settings

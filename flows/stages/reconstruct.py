@@ -253,6 +253,6 @@ STAGE = Stage(
     execute,
     version=5,
     reads=("poses", "decode"),
-    settings=settings_of("reconstruct", "seed"),
+    settings=settings_of("reconstruct", "seed", unless={"method": "zipnerf"}),
     inputs=inputs,
 )
