@@ -9,7 +9,6 @@ import yaml
 
 from schemas.errors import ConfigError
 
-
 #: What the short names `method: NAME` and `--method NAME` stand for.
 METHODS: dict[str, dict[str, Any]] = {
     "auto": {"generate": "auto"},

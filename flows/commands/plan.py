@@ -8,9 +8,9 @@ from typing import Any
 
 from flows.commands.run import make_config
 from flows.jobs.job import Job, Request
+from flows.media.plan_drawing import plan_table
 from flows.pipeline.runner import opened, run_missing
 from flows.progress import console
-from flows.reporting.plan_drawing import plan_table
 from flows.stages.plan import plan_run
 from schemas.scene_store import SceneStore
 

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, PrivateAttr
 
 from flows.errors import InputError
 from flows.jobs.scene import Scene
+from flows.jobs.usage import Usage
 from flows.readers.base import Capture
 from schemas.config import RunConfig
 from schemas.decisions import Decision
@@ -105,10 +106,12 @@ class SplitError(InputError):
 
 
 class Outcome(NamedTuple):
-    """What a stage did: `work` counts (views, rays, ...); `decisions` say what was chosen, skipped or is wrong."""
+    """What a stage did: `work` counts (views, rays, ...); `decisions` say what was chosen, skipped or is wrong; `usage`
+    is that of other processes that had a share of the work."""
 
     work: dict[str, float] = {}
     decisions: list[Decision] = []
+    usage: Usage = Usage()
 
 
 @dataclass(frozen=True)

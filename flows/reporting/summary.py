@@ -13,7 +13,8 @@ from rich.table import Table
 
 from flows.progress import console
 from flows.reporting.published import PUBLISHED
-from schemas.layout import SCENE_STAGES, STAGES
+from flows.stages import STAGES
+from schemas.layout import SCENE_STAGES
 from schemas.tables import METRICS, TIMINGS, read_rows
 
 METRIC_NAMES = ("psnr_db", "ssim", "lpips")
@@ -124,9 +125,10 @@ def timing_rows(out: Path) -> list[dict[str, Any]]:
     for scene, run in runs:
         stages = {}
         for stage in STAGES:
-            row = latest.get((scene, "" if stage in SCENE_STAGES else run, stage))
-            if row and not (stage == "encode" and (scene, run, "sample") not in latest):
-                stages[stage] = row["seconds"]
+            row = latest.get((scene, run if stage.per == "run" else "", stage.name))
+            users = [(scene, run, other.name) for other in STAGES if stage.name in other.reads]
+            if row and not (stage.passing and not latest.keys() & set(users)):
+                stages[stage.name] = row["seconds"]
         method = next(r["method"] for (s, name, _), r in latest.items() if (s, name) == (scene, run))
         row = {"scene_id": scene, "run": run, "method": method, "stages": stages, "total": sum(stages.values())}
         out_rows.append(row)
@@ -138,7 +140,7 @@ def method_times(timings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     rows = []
     for method in sorted({t["method"] for t in timings}, key=method_order):
         own = [t for t in timings if t["method"] == method]
-        stages = {s: sum(t["stages"].get(s, 0.0) for t in own) / len(own) for s in STAGES}
+        stages = {s.name: sum(t["stages"].get(s.name, 0.0) for t in own) / len(own) for s in STAGES}
         stages = {s: v for s, v in stages.items() if v}
         rows.append({"method": method, "runs": len(own), "stages": stages, "total": sum(stages.values())})
     return rows
