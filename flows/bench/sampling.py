@@ -1,6 +1,7 @@
 """Benchmark of the fan-out: speed-up and overhead of worker processes and of a Dask cluster, costs of the parts.
 
-`python -m flows.bench.sampling WORK [--model FILE] [--groups 24]` prints what `docs/scaling.md` calculates with.
+`python -m flows.bench.sampling WORK [--model FILE] [--groups 24]` prints what
+`docs/explanation/scaling.md` calculates with.
   share    wall time, workers' busy seconds, overhead = workers * wall / busy - 1, of sampling real groups, by executor
   batch    seconds a batch costs apart from its groups: handed groups that are done already, a worker only looks
   store    operations per second on the store: latents written, marks written, marks read

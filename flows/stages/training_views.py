@@ -30,7 +30,7 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, float,
     else:
         made = list(generated_views(run))
         if job.config.skip.detail:
-            # It would be learned at the cost of what all views have in common (docs/sweeps.md).
+            # It would be learned at the cost of what all views have in common (docs/guides/sweep.md).
             finest = float(cameras.intrinsics[:, 0, 0].max())
             whole, made = made, [no_finer(*view, finest) for view in made]
             reduced = [(a, b) for (_, a), (_, b) in zip(whole, made, strict=True) if a is not b]
