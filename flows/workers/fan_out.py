@@ -42,9 +42,8 @@ class Totals:
 
     def work(self) -> dict[str, float]:
         """Counts for the stage's record."""
-        return {
-            name: value for name, value in vars(self).items() if name not in ("decisions", "usage") and self.workers
-        }
+        counts = ("workers", "batches", "busy_seconds", "loading_seconds")
+        return {name: getattr(self, name) for name in counts if self.workers}
 
 
 @dataclass

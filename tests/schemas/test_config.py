@@ -10,6 +10,7 @@ import pytest
 from schemas.config import RunConfig, json_schema, load_config, parse_config
 from schemas.content_key import content_key
 from schemas.errors import ConfigError
+from schemas.settings import merged
 
 
 def test_yaml_and_json_say_the_same(tmp_path: Path) -> None:
