@@ -1,8 +1,7 @@
-"""One run of one scene, the request that asks for such runs, and what a stage of it did."""
+"""One run of one scene, and what a stage of it did."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -112,40 +111,3 @@ class Outcome(NamedTuple):
     work: dict[str, float] = {}
     decisions: list[Decision] = []
     usage: Usage = Usage()
-
-
-@dataclass(frozen=True)
-class Request:
-    """What a command asks for: runs of one scene, one for each of `views` (splits), with one configuration."""
-
-    source: str
-    out: Path
-    views: tuple[str, ...] = ("all",)
-    config: RunConfig = RunConfig()
-    reader: str = "auto"
-    image_folder: str | None = None
-
-    def jobs(self, scene: Scene | None = None) -> list[Job]:
-        """A job for each split, with `generate: auto` decided. scene: where that was read already.
-
-        Raises InputError for bad input, SplitError for an unknown split.
-        """
-        scene = scene or Scene(str(self.source), self.reader, self.image_folder)
-        jobs = []
-        for split in self.views:
-            config = self.config.model_copy(update={"split": str(split)})
-            job = Job(
-                source=scene.source,
-                reader=scene.reader,
-                image_folder=scene.image_folder,
-                out=self.out,
-                scene_id=scene.capture.scene_id,
-                dataset=scene.capture.dataset,
-                config=config,
-            ).sharing(scene)
-            few = len(job.split["train"]) == 1
-            if config.generate == "auto":
-                config = config.model_copy(update={"generate": "always" if few else "never"})
-                job = job.model_copy(update={"config": config})
-            jobs.append(job)
-        return jobs

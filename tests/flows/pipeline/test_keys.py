@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flows.commands.run import make_config
 from flows.jobs import scene
-from flows.jobs.job import Job, Outcome, Request
+from flows.jobs.job import Job, Outcome
+from flows.jobs.request import Request, make_config
 from flows.jobs.stage import Stage
 from flows.pipeline import keys
 from flows.pipeline.keys import downstream, pending, upstream

@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flows.commands.run import make_config
-from flows.jobs.job import Request
+from flows.jobs.request import Request, make_config
 from flows.pipeline.keys import pending
 from schemas.scene_store import SceneStore
 from schemas.tables import METRICS, TIMINGS, read_rows
