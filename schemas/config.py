@@ -89,8 +89,8 @@ class SampleConfig(_Model):
 
     checkpoint: Path | None = None
     """Weights of the model; None: the ones shipped."""
-    solver: Literal["ddim", "dpm++", "unipc"] | None = None
-    """Solver of the probability-flow ODE (paper: ddim)."""
+    solver: str | None = None
+    """Solver of the probability-flow ODE (paper: ddim): ddim, dpm++, unipc, or a further one of the core's SOLVERS."""
     nodes: Literal["trailing", "linspace", "log_snr", "karras"] | None = None
     """Spacing of the noise levels (paper: trailing)."""
     steps: Annotated[int, Field(ge=1)] | None = None

@@ -22,9 +22,9 @@ from flows.jobs.request import Request, make_config
 from flows.pipeline.keys import Step, stages_of
 from flows.pipeline.runner import execute_stage, opened, run_missing
 from flows.readers import read_capture
+from flows.reconstruction.stored import Checkpoint
 from flows.reporting.report import write_report
 from flows.reporting.summary import number, summary_rows
-from flows.stages.reconstruct import Checkpoint
 from schemas.layout import LAYOUT, SCENE_STAGES
 from schemas.scene_store import SceneStore
 from schemas.skip import SkipConfig

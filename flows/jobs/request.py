@@ -7,9 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from cat3d_core.diffusion.solvers import check_solver
 from flows.jobs.job import Job
 from flows.jobs.scene import Scene
 from schemas.config import RunConfig, load_config, parse_config
+from schemas.errors import ConfigError
 from schemas.settings import merged, set_at, settings_document, value_at
 
 #: Where each command-line option lives in the configuration.
@@ -38,8 +40,13 @@ class Request:
     def jobs(self, scene: Scene | None = None) -> list[Job]:
         """A job for each split, with `generate: auto` decided. scene: where that was read already.
 
-        Raises InputError for bad input, SplitError for an unknown split.
+        Raises InputError for bad input, SplitError for an unknown split, ConfigError for an unknown solver.
         """
+        if self.config.sample.solver is not None:
+            try:  # solvers are registered in the core, which the schemas do not see
+                check_solver(self.config.sample.solver)
+            except ValueError as error:
+                raise ConfigError(f"sample.solver: {error}") from None
         scene = scene or Scene(self.source, self.reader, self.image_folder)
         jobs = []
         for split in self.views:

@@ -130,7 +130,7 @@ def stale_stages(
         if record is None:
             continue
         read = next(one.reads for one in STAGES if one.name == stage)
-        inputs = [(owner, name) for owner in (None, run) for name in read]
+        inputs = [(owner, name) for name in read for owner in (None, run)]
         changed = [name for owner, name in inputs if (owner, name) in stale]
         if (run, stage) in expected and record.key not in expected[run, stage]:
             stale[run, stage] = "its inputs, configuration or code have changed"

@@ -15,8 +15,6 @@ from flows.jobs.device import visible_gpus
 from flows.workers.work import Answer, Batch
 from schemas.config import ExecutionConfig
 
-STOP_TIMEOUT_S = 5.0
-
 
 class LocalExecutor:
     """Starts workers as they are needed, and new ones for those that die. Batches and answers are lines of JSON."""

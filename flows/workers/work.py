@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 from pydantic import BaseModel, ConfigDict, Field, ImportString
 
-from cat3d_core.zipnerf import NonFiniteError
+from cat3d_core.reconstruction import NonFiniteError
 from flows.errors import InputError, WorkerError
 from flows.jobs.device import cpu_threads
 from flows.jobs.job import Job

@@ -21,9 +21,9 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.metrics.geometry import nearest_distances
 from cat3d_core.normalization import Similarity
 from cat3d_core.rays import image_rays
+from cat3d_core.reconstruction import Render, normals_from_depth, point_cloud, surface_depth
 from cat3d_core.synthetic.capture import look_at
-from cat3d_core.zipnerf import PRESETS, Field, Render, point_cloud, render_ladder, surface_depth
-from cat3d_core.zipnerf.render import normals_from_depth
+from cat3d_core.zipnerf import PRESETS, Field, render_ladder
 from flows.bench.geometry import mesh_row, sample_surface, true_depths
 from flows.bench.reconstruct import procedural_views
 from flows.cli import app
