@@ -70,7 +70,8 @@ def pool(hidden: Tensor, valid: Tensor) -> Tensor:
     """Any number of photos, in any order, to one vector a voxel: weighted mean and variance over those that see it.
 
     hidden (N, M, ..., C + 1): the logit of the weight, then numbers that are cut at 0; valid (N, M, ...) ->
-    (N, ..., 2 C + 2): mean, variance, sum of weights, share of photos that see it. By the C++ kernel where there is one."""
+    (N, ..., 2 C + 2): mean, variance, sum of weights, share of photos that see it.
+    By the C++ kernel where there is one."""
     if valid.dtype == torch.float32 and warp_cpu.available(hidden):
         return warp_cpu.pool(hidden, valid)
     return pool_reference(hidden, valid)
