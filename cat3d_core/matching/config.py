@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -38,5 +39,5 @@ class SweepConfig:
     @staticmethod
     def from_json(text: str) -> SweepConfig:
         """What `to_json` wrote."""
-        document = json.loads(text)
-        return SweepConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in document.items()})
+        fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in json.loads(text).items()}
+        return SweepConfig(**fields)

@@ -14,7 +14,7 @@ from cat3d_core.matching.planes import inverse_depth_of, local_mean
 from cat3d_core.matching.warp import Views, pair_maps, project, take
 
 _GROUPS = 4
-_SPREAD = (-6.0, 0.0)
+_SPREAD = (-5.0, 0.0)
 
 
 @dataclass(frozen=True)

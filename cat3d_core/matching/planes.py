@@ -8,19 +8,19 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-# A photo's planes lie evenly in t, with inverse depth = _SCALE * (exp(rate * t) - 1): nearly evenly in inverse depth
+# A photo's planes lie evenly in t, with inverse depth = SCALE * (exp(rate * t) - 1): nearly evenly in inverse depth
 # about the unit distance, where most surfaces of a normalised scene are, and evenly in its logarithm close by.
-_SCALE = 0.9
+SCALE = 0.9
 
 
 def inverse_depth_of(t: Tensor, nearest: float) -> Tensor:
     """Inverse depth at t: 0 at t = 0, `nearest` at t = 1."""
-    return _SCALE * torch.expm1(t * math.log1p(nearest / _SCALE))
+    return SCALE * torch.expm1(t * math.log1p(nearest / SCALE))
 
 
 def position_of(inverse_depth: Tensor, nearest: float) -> Tensor:
     """The t of an inverse depth >= 0, the inverse of `inverse_depth_of`; not clamped to 1."""
-    return torch.log1p(inverse_depth.clamp(min=0) / _SCALE) / math.log1p(nearest / _SCALE)
+    return torch.log1p(inverse_depth.clamp(min=0) / SCALE) / math.log1p(nearest / SCALE)
 
 
 def soft_assignment(position: Tensor, planes: int) -> Tensor:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from cat3d_core.matching import warp_cpu
 from cat3d_core.matching.config import SweepConfig
 from cat3d_core.matching.layers import Residual, UNet
 from cat3d_core.matching.photos import Observed
@@ -15,15 +16,14 @@ from cat3d_core.matching.planes import position_of, quantiles
 from cat3d_core.matching.warp import Maps, pixel_grid, project, take
 
 _EVIDENCE = 8
+_LEAST_WEIGHT = 1e-2
 
 
-@dataclass(frozen=True)
-class Gathered:
-    """Per photo and hypothesis: features (N, M, K, h, w, C), evidence (N, M, K, h, w, 8), valid (N, M, K, h, w, 1);
-    agreement (N, M, K, h, w): logarithm of how well the photo's own depth agrees, at most 0."""
+class Gathered(NamedTuple):
+    """Per photo and hypothesis: voxels (N, M, K, h, w, C + 8), features and evidence; valid (N, M, K, h, w), 1 inside
+    the photo's image; agreement (N, M, K, h, w): logarithm of how well the photo's own depth agrees, at most 0."""
 
-    features: Tensor
-    evidence: Tensor
+    voxels: Tensor
     valid: Tensor
     agreement: Tensor
 
@@ -33,12 +33,21 @@ def gather(
 ) -> Gathered:
     """Read features (B, C, h', w') and the photos' own depth where the hypotheses (N, K, h, w) fall.
 
-    photos (N, M): the rows of `observed` that each target is swept through."""
+    photos (N, M): the rows of `observed` that each target is swept through. By the C++ kernel where there is one."""
+    own = torch.cat([observed.position, observed.log_spread], 1)
+    if inverse_depth.dtype == torch.float32 and warp_cpu.available(features):
+        return Gathered(*warp_cpu.gather(features, own, photos, maps, inverse_depth, nearest))
+    return gather_reference(features, own, photos, maps, inverse_depth, nearest)
+
+
+def gather_reference(
+    features: Tensor, own: Tensor, photos: Tensor, maps: Maps, inverse_depth: Tensor, nearest: float
+) -> Gathered:
+    """`gather` in plain torch; own (B, 2, h'', w''): the photos' position and log_spread."""
     at = project(maps, inverse_depth)
     n, m = photos.shape
     grid, rows = at.grid.flatten(0, 1), photos.flatten()
     read = take(features[rows], grid).unflatten(0, (n, m))
-    own = torch.cat([observed.position, observed.log_spread], 1)
     # The nearest pixel's depth: between two surfaces there is none in the middle.
     depth = take(own[rows], grid, "nearest").unflatten(0, (n, m))
     behind = depth[:, :, 0] - position_of(at.inverse_depth, nearest)  # > 0: the point is behind what the photo shows
@@ -54,11 +63,32 @@ def gather(
         ], -1,
     )  # fmt: skip
     agreement = torch.log(0.05 + 0.95 * torch.exp(-units.abs() / 2))
-    return Gathered(read.permute(0, 1, 3, 4, 5, 2), evidence, valid[..., None], agreement)
+    return Gathered(torch.cat([read.permute(0, 1, 3, 4, 5, 2), evidence], -1), valid, agreement)
+
+
+def pool(hidden: Tensor, valid: Tensor) -> Tensor:
+    """Any number of photos, in any order, to one vector a voxel: weighted mean and variance over those that see it.
+
+    hidden (N, M, ..., C + 1): the logit of the weight, then numbers that are cut at 0; valid (N, M, ...) ->
+    (N, ..., 2 C + 2): mean, variance, sum of weights, share of photos that see it.
+    By the C++ kernel where there is one."""
+    if valid.dtype == torch.float32 and warp_cpu.available(hidden):
+        return warp_cpu.pool(hidden, valid)
+    return pool_reference(hidden, valid)
+
+
+def pool_reference(hidden: Tensor, valid: Tensor) -> Tensor:
+    """`pool` in plain torch."""
+    weight = valid[..., None] * (torch.sigmoid(hidden[..., :1]) + _LEAST_WEIGHT)
+    x, total = F.relu(hidden[..., 1:]), weight.sum(1)
+    share = weight / total.clamp(min=_LEAST_WEIGHT)[:, None]
+    mean = (x * share).sum(1)
+    variance = ((x - mean[:, None]).square() * share).sum(1)
+    return torch.cat([mean, variance, total, valid.mean(1)[..., None].to(mean.dtype)], -1)
 
 
 class Aggregate(nn.Module):
-    """Any number of photos, in any order, to one vector a voxel: weighted mean and variance over those that see it."""
+    """What is gathered from the photos, to one vector a voxel."""
 
     def __init__(self, features: int, hidden: int, extra: int, width: int) -> None:
         super().__init__()
@@ -68,16 +98,10 @@ class Aggregate(nn.Module):
 
     def forward(self, gathered: Gathered, extra: Tensor) -> tuple[Tensor, Tensor]:
         """extra (N, K, h, w, E) -> volume (N, width, K, h, w) and each photo's hidden vectors (N, M, K, h, w, C)."""
-        x = F.relu(self.enter(torch.cat([gathered.features, gathered.evidence], -1)))
-        x = self.hidden(x)
-        weight = gathered.valid.to(x.dtype) * (torch.sigmoid(x[..., :1]) + 1e-2)
-        hidden = F.relu(x[..., 1:])
-        total = weight.sum(1)
-        mean = (hidden * weight).sum(1) / total.clamp(min=1e-2)
-        variance = ((hidden - mean[:, None]).square() * weight).sum(1) / total.clamp(min=1e-2)
-        seen = gathered.valid.mean(1).to(x.dtype)
-        out = self.leave(torch.cat([mean, variance, total, seen, extra.to(x.dtype)], -1))
-        return out.permute(0, 4, 1, 2, 3), hidden
+        hidden = self.hidden(F.relu(self.enter(gathered.voxels)))
+        pooled = pool(hidden, gathered.valid)
+        out = self.leave(torch.cat([pooled, extra.to(pooled.dtype)], -1))
+        return out.permute(0, 4, 1, 2, 3), F.relu(hidden[..., 1:])
 
 
 class TargetDepth(nn.Module):

@@ -101,9 +101,9 @@ def project(maps: Maps, inverse_depth: Tensor) -> Projected:
 
 
 def take(maps: Tensor, grid: Tensor, mode: str = "bilinear") -> Tensor:
-    """Read photos at places: maps (B, C, H, W), grid (B, K, h, w, 2) -> (B, C, K, h, w) in float32; outside the image
-    the border's values."""
-    b, count, h, w = grid.shape[:4]
-    flat = grid.reshape(b, count * h, w, 2)
-    out = F.grid_sample(maps.float(), flat, mode=mode, padding_mode="border", align_corners=False)
-    return out.reshape(b, -1, count, h, w)
+    """Read photos at places: maps (B, C, H, W), grid (B, K, h, w, 2) -> (B, C, K, h, w) in the grid's dtype; outside
+    the image the border's values."""
+    count, h = grid.shape[1:3]
+    flat = grid.flatten(1, 2)
+    out = F.grid_sample(maps.to(grid.dtype), flat, mode=mode, padding_mode="border", align_corners=False)
+    return out.unflatten(2, (count, h))

@@ -1,4 +1,4 @@
-"""The default model that is shipped with the package. See README.md beside this file for what it is."""
+"""The weights that are shipped with the package. See README.md beside this file for what they are."""
 
 from __future__ import annotations
 
@@ -23,5 +23,16 @@ def default_model_path() -> Path:
         raise FileNotFoundError(
             f"This installation carries no default model ({path} is missing): install the package again, train one "
             "with `cat3d train default`, or name a model file."
+        )
+    return path
+
+
+def default_sweep_path() -> Path:
+    """The shipped plane sweep's file (`cat3d_core.matching`). Raises FileNotFoundError where it is missing."""
+    path = Path(__file__).with_name("sweep.safetensors")
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"This installation carries no plane sweep ({path} is missing): install the package again, train one with "
+            "`cat3d train sweep`, or do without hints."
         )
     return path

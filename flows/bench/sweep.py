@@ -24,6 +24,7 @@ from torch import Tensor
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.diffusion import load_model
+from cat3d_core.matching.checkpoint import load_sweep
 from cat3d_core.matching.composite import Composite
 from cat3d_core.matching.hint import Hint, hint, observe
 from cat3d_core.matching.network import SweepNetwork
@@ -66,13 +67,14 @@ def cases(cache: Path, scenes: int, given: Sequence[int], data: Path | None) -> 
         for family in FAMILIES:
             for m in given:
                 stored = _procedural(cache / f"{family}_{number:03d}_{m}.safetensors", family, number, m)
-                yield _case((family, "all"), m, stored)
+                yield case((family, "all"), m, stored)
     for scene in captured_scenes(data):
         for m in given:
-            yield _case((scene.name, ALL_CAPTURED), m, _captured(cache / f"{scene.name}_{m}.safetensors", scene, m))
+            yield case((scene.name, ALL_CAPTURED), m, _captured(cache / f"{scene.name}_{m}.safetensors", scene, m))
 
 
-def _case(labels: tuple[str, ...], given: int, stored: dict[str, Tensor]) -> Case:
+def case(labels: tuple[str, ...], given: int, stored: dict[str, Tensor]) -> Case:
+    """A group as it is kept in the cache (`sampled`)."""
     stored = dict(stored)
     image = stored.pop("image")
     size = torch.tensor([[image.shape[-1], image.shape[-2]]]).repeat(len(image), 1)
@@ -84,7 +86,7 @@ def _case(labels: tuple[str, ...], given: int, stored: dict[str, Tensor]) -> Cas
 _MODEL: list[Any] = []
 
 
-def _sampled(image: Tensor, cameras: Cameras, given: int, key: tuple) -> dict[str, Tensor]:
+def sampled(image: Tensor, cameras: Cameras, given: int, key: tuple) -> dict[str, Tensor]:
     """`sample` and `nearest`, with the shipped model, which is loaded when it is first needed."""
     if not _MODEL:
         model = load_model(default_model_path())
@@ -99,7 +101,7 @@ def _sampled(image: Tensor, cameras: Cameras, given: int, key: tuple) -> dict[st
 def _procedural(path: Path, family: str, number: int, given: int) -> dict[str, Tensor]:
     if not path.exists():
         traced, cameras = held_out_group(family, number, SIZE, VIEWS)
-        parts = _sampled(traced.image, cameras, given, (family, number))
+        parts = sampled(traced.image, cameras, given, (family, number))
         save(path, parts | {"warp": warped(traced, cameras, given).half(), "inverse_depth": 1 / traced.depth[given:]})
     return load_file(path)
 
@@ -107,7 +109,7 @@ def _procedural(path: Path, family: str, number: int, given: int) -> dict[str, T
 def _captured(path: Path, scene: Path, given: int) -> dict[str, Tensor]:
     if not path.exists():
         image, cameras = captured_group(scene, SIZE, given, VIEWS)
-        save(path, _sampled(image, cameras, given, (scene.name,)))
+        save(path, sampled(image, cameras, given, (scene.name,)))
     return load_file(path)
 
 
@@ -208,10 +210,8 @@ def main() -> None:
         for _ in found:
             pass
         return
-    network = SweepNetwork()
-    network.load_state_dict(load_file(options.network))
-    perceptual = find_perceptual()
-    rows = scores(network.eval(), found, Composite(), perceptual)
+    network, perceptual = load_sweep(options.network), find_perceptual()
+    rows = scores(network, found, network.composite, perceptual)
     if options.json:
         options.json.write_text(json.dumps(rows))
     print(table(rows, perceptual.name if perceptual else None))

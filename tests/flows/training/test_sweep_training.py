@@ -70,9 +70,10 @@ def test_stopped_and_resumed_it_is_the_same_to_the_bit(
 
     out = settings.parent / "legs"
     # The schedule belongs to six steps; the first leg is interrupted where the first checkpoint has been written.
-    with pytest.raises(KeyboardInterrupt), monkeypatch.context() as patch:
-        patch.setattr(GeometryBank, "refresh", interrupt)
+    monkeypatch.setattr(GeometryBank, "refresh", interrupt)
+    with pytest.raises(KeyboardInterrupt):
         train_command(str(settings), out, {}, ["save_minutes=1e-9"], False)
+    monkeypatch.undo()
     assert int(load_file(out / "state.safetensors")["steps"]) == 1
     train_command(str(settings), out, {}, [], False)
     state = load_file(out / "state.safetensors")
