@@ -172,7 +172,7 @@ def write_png(path: Path | str, image: np.ndarray | Tensor) -> None:
 
 
 def write_jpeg(path: Path | str, image: np.ndarray | Tensor, quality: int = 93) -> None:
-    """As `write_png`, in JPEG (no alpha, 4:4:4)."""
+    """Write an image as JPEG, without alpha or chroma subsampling (4:4:4); otherwise like `write_png`."""
     _write(Path(path), to_uint8(image), {"Compression": f"jpeg:{quality}", "jpeg:subsampling": "4:4:4"})
 
 
