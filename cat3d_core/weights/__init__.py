@@ -25,14 +25,3 @@ def default_model_path() -> Path:
             "with `cat3d train default`, or name a model file."
         )
     return path
-
-
-def default_sweep_path() -> Path:
-    """The shipped plane sweep's file (`cat3d_core.matching`). Raises FileNotFoundError where it is missing."""
-    path = Path(__file__).with_name("sweep.safetensors")
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"This installation carries no plane sweep ({path} is missing): install the package again, train one with "
-            "`cat3d train sweep`, or do without hints."
-        )
-    return path

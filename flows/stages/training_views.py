@@ -47,8 +47,8 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
             decisions.append(skipped(text, "covered_path"))
     captured = torch.arange(len(cameras)) < len(train)
     maps = hint_maps(len(train), made)
-    views, told = unseen_alone(job, Views.from_images(cameras, images, captured, **maps))
-    return views, decisions + told
+    views, more = unseen_alone(job, Views.from_images(cameras, images, captured, **maps))
+    return views, decisions + more
 
 
 def hint_maps(captured: int, made: Sequence[GeneratedView]) -> dict[str, list[torch.Tensor | None]]:
@@ -86,9 +86,9 @@ def unseen_alone(job: Job, views: Views) -> tuple[Views, list[Decision]]:
     started = time.monotonic()
     shown = shown_by_captured(job, views)
     share = float(shown.sum() / views.size[~views.captured].prod(-1).sum())
-    told = (
+    text = (
         f"{share:.0%} of the pixels of generated views were not trained on, since {LEAST} captured views show their "
         f"places as well: so says a field of those alone ({time.monotonic() - started:.0f} s). At least as large a "
         "share of the rays is theirs."
     )
-    return views.only(~shown), [skipped(told, "seen", pixels=int(shown.sum()))]
+    return views.only(~shown), [skipped(text, "seen", pixels=int(shown.sum()))]
