@@ -10,13 +10,20 @@ import typer
 from flows.errors import InputError
 from flows.pipeline.jobs import Job, capture_digests, expected_steps
 from flows.progress import console
-from flows.reporting.inspect import as_text, inspect_store
+from flows.reporting.inspect import inspect_store
+from flows.reporting.inspect_array import contact_sheet, inspect_array
+from flows.reporting.inspect_text import as_text, one_array_text
 from schemas.layout import SCENE_STAGES
 from schemas.scene_store import SceneStore
 
 
-def inspect_command(path: Path, verify: bool, as_json: bool) -> None:
-    """Print the inspection of a store as text or JSON."""
+def inspect_command(path: Path, array: str | None, verify: bool, as_json: bool, png: Path | None) -> None:
+    """Print the inspection of a store, or of one of its arrays, as text or JSON; `png`: draw that array or plan."""
+    if png is not None and array is None:
+        raise InputError("--png draws one array or plan: name it after the store, such as captured/image.")
+    if array is not None:
+        _inspect_one(path, array, as_json, png)
+        return
     expected, note = expected_keys(path)
     report = inspect_store(path, verify_chunks=verify, expected=expected)
     if as_json:
@@ -27,6 +34,26 @@ def inspect_command(path: Path, verify: bool, as_json: bool) -> None:
             console.print(f"[dim]{note}[/dim]")
     if not report["ok"]:
         raise typer.Exit(1)
+
+
+def _inspect_one(path: Path, array: str, as_json: bool, png: Path | None) -> None:
+    """One array in full; with `png` its contact sheet, or the drawing of a plan."""
+    store = SceneStore.open(path)
+    parts = array.strip("/").split("/")
+    if len(parts) == 3 and parts[0] == "runs" and parts[2] == "plan":
+        if png is None:
+            raise InputError(f"{array} is a whole plan: --png FILE draws it; name one of its arrays for its numbers.")
+        png.write_bytes(drawn_plan(store, parts[1]))
+    else:
+        report = inspect_array(store, array)
+        if as_json:
+            print(json.dumps(report, indent=1))
+        else:
+            console.print(one_array_text(report))
+        if png is not None:
+            contact_sheet(store, array, png)
+    if png is not None:
+        console.print(f"Drawn: {png}")
 
 
 def expected_keys(path: Path) -> tuple[dict[tuple[str | None, str], set[str]] | None, str]:
