@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flows.errors import InputError
 from flows.media.images import write_png
-from flows.media.pictures import depth_picture
+from flows.media.pictures import depth_picture, share_picture
 from flows.reporting.inspect import array_row
 from schemas import arrays
 from schemas.documents import nodes, read_metadata
@@ -80,6 +80,8 @@ def contact_sheet(store: SceneStore, path: str, target: Path) -> None:
     views = np.linspace(0, shape[0] - 1, min(shape[0], SHEET_VIEWS)).round().astype(int).tolist()
     empty = np.zeros((CELL, CELL, 3), np.uint8)  # what was never written is black
     read = arrays.read_views(store.folder / name, views)
+    if spec is not None and kind == "depth" and spec.unit != "scene unit":
+        kind = "share"
     cells = [_cell(value, kind) if isinstance(value, np.ndarray) else empty for value in read]
     columns = math.ceil(math.sqrt(len(cells)))
     height, width = (max(cell.shape[axis] for cell in cells) for axis in (0, 1))
@@ -94,6 +96,8 @@ def _cell(value: NDArray[Any], kind: str) -> NDArray[np.uint8]:
     """One view as an (h, w, 3) uint8 picture, small ones enlarged and large ones thinned to about `CELL` pixels."""
     if kind == "depth":
         picture = depth_picture(value.astype(np.float32))
+    elif kind == "share":
+        picture = share_picture(value)
     elif kind == "latent":
         channels = value[:3].astype(np.float32)
         low, high = np.quantile(channels, [0.01, 0.99])
