@@ -18,7 +18,7 @@ from cat3d_core.synthetic.dataset import surface_points
 from flows.training.worlds.light import Light, Sky, radiance, sunlit
 from flows.training.worlds.placing import KINDS, place
 from flows.training.worlds.textures import srgb_from_linear
-from flows.training.worlds.world import World
+from flows.training.worlds.world import World, dot
 
 ATTEMPTS = 60
 # 99 % of a group's pixels are no nearer than this inverse depth (scene units); a plane sweep sees up to 2.8 or so.
@@ -125,7 +125,7 @@ def _coarse_look(world: World, cameras: Cameras) -> tuple[Tensor, NDArray, NDArr
         found, d = hits.found, directions[hits.found]
         depths.append(torch.from_numpy(hits.distance.reshape(_COARSE, _COARSE)))
         face = world.face_normals[hits.triangle[found]]
-        behind = (face * d).sum(-1) > 0
+        behind = dot(face, d) > 0
         opaque = world.table.kind[world.material[hits.triangle[found]]] == 0
         back, solid = back + int((behind & opaque).sum()), solid + int(opaque.sum())
         points.append(origins[found] + hits.distance[found, None] * d)

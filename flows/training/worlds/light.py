@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flows.training.worlds.scene import TrackScene
 from flows.training.worlds.textures import LINEAR_FROM_SRGB, read_texture
-from flows.training.worlds.world import Hits, World
+from flows.training.worlds.world import Hits, World, dot
 
 # Of each face of a sky box (top, bottom, east, west, south, north): where it lies, and where the right and the lower
 # edge of its picture point, seen from inside. East is +x, north +y.
@@ -97,13 +97,13 @@ def radiance(world: World, hits: Hits, origins: NDArray, directions: NDArray, pi
         return out
     met = Hits(hits.distance[rows], hits.triangle[rows], hits.weights[rows])
     d = directions[rows]
-    length = np.linalg.norm(d, axis=-1)
+    length = np.sqrt(dot(d, d))
     points = origins[rows] + met.distance[:, None] * d
     face = world.face_normals[met.triangle]
-    behind = (face * d).sum(-1, keepdims=True) > 0
+    behind = dot(face, d)[:, None] > 0
     face, normal = np.where(behind, -face, face), world.shading_normals(met)
     normal = np.where(behind, -normal, normal)
-    slant = np.abs((face * d).sum(-1)) / length
+    slant = np.abs(dot(face, d)) / length
     # Between the footprint's short side and its long one: less blur than the one, less flicker than the other.
     footprint = met.distance * length * pixel / np.sqrt(np.maximum(slant, 0.05))
     material = world.material[met.triangle]

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.training.worlds.world import World
+from flows.training.worlds.world import World, dot
 
 Eyes = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Camera centres and what they look at, (C, 3) each, in order along the path."""
@@ -36,7 +36,7 @@ def free(world: World, eyes: NDArray, clearance: float = CLEARANCE) -> NDArray[n
     origins = np.repeat(eyes, len(bundle), 0)
     directions = np.tile(bundle, (len(eyes), 1))
     hits = world.cast(origins, directions)
-    behind = (world.face_normals[hits.triangle] * directions).sum(-1) > 0
+    behind = dot(world.face_normals[hits.triangle], directions) > 0
     behind = (behind & hits.found).reshape(len(eyes), -1)
     near = hits.distance.reshape(len(eyes), -1).min(1)
     found = hits.found.reshape(len(eyes), -1)

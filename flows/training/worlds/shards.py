@@ -16,7 +16,7 @@ from flows.training.worlds.placing import KINDS
 from flows.training.worlds.scene import read_track
 from flows.training.worlds.world import World
 
-SHARD_GROUPS = 20
+SHARD_GROUPS = 10
 # `family` of a shard: the procedural families come first.
 FIRST_FAMILY = 5
 

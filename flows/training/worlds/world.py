@@ -87,7 +87,7 @@ class World:
         rays = np.concatenate([origins, directions], -1).astype(np.float32)
         count = len(rays)
         hits = Hits(np.full(count, np.inf, np.float32), np.full(count, -1), np.zeros((count, 3), np.float32))
-        rows, passed, length = np.arange(count), np.zeros(count, np.float32), np.linalg.norm(rays[:, 3:], axis=-1)
+        rows, passed, length = np.arange(count), np.zeros(count, np.float32), np.sqrt(dot(rays[:, 3:], rays[:, 3:]))
         for layer in range(MAX_LAYERS):
             answer = self._embree.cast_rays(o3d.core.Tensor(rays[rows]))
             step = answer["t_hit"].numpy()
@@ -95,7 +95,7 @@ class World:
             rows, step = rows[met], step[met]
             triangle = answer["primitive_ids"].numpy()[met].astype(np.int64)
             uv = answer["primitive_uvs"].numpy()[met]
-            weights = np.concatenate([1 - uv.sum(-1, keepdims=True), uv], -1)
+            weights = np.stack([1 - uv[:, 0] - uv[:, 1], uv[:, 0], uv[:, 1]], -1)
             solid = self._solid(triangle, weights) if layer < MAX_LAYERS - 1 else np.ones(len(rows), bool)
             done = rows[solid]
             hits.distance[done] = passed[done] + step[solid]
@@ -146,8 +146,13 @@ class World:
         """(R, 3) unit normals of hit surfaces, smooth where the mesh says so, on the side of the face's own."""
         smooth = interpolate(self.normals, self.triangles[hits.triangle], hits.weights)
         face = self.face_normals[hits.triangle]
-        smooth = np.where((smooth * face).sum(-1, keepdims=True) > 0.1, smooth, face)
-        return smooth / np.maximum(np.linalg.norm(smooth, axis=-1, keepdims=True), 1e-6)
+        smooth = np.where(dot(smooth, face)[:, None] > 0.1, smooth, face)
+        return smooth / np.maximum(np.sqrt(dot(smooth, smooth)), 1e-6)[:, None]
+
+
+def dot(a: NDArray, b: NDArray) -> NDArray:
+    """(R,) products of vectors (R, C)."""
+    return np.einsum("rc,rc->r", a, b)
 
 
 def interpolate(values: NDArray, corners: NDArray, weights: NDArray) -> NDArray[np.float32]:
