@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from flows.readers.base import InputError
+from flows.errors import InputError
 
 # Licences that allow rendering training pictures from the work, with credit and under the same terms where they ask
 # for it. What has none of these is left out.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.readers.base import InputError
+from flows.errors import InputError
 from flows.training.worlds.scene import find_file, read_xml, texture_folders
 from flows.training.worlds.textures import GREY, read_texture
 
@@ -45,10 +45,10 @@ class MaterialTable:
 
 
 class Materials:
-    """Numbers materials as meshes name them. kinds: of each number."""
+    """Numbers materials as meshes name them. kinds: of each number; usable: whether a file may be read."""
 
-    def __init__(self, data: Path, track: Path) -> None:
-        self._data, self._track = data, track
+    def __init__(self, data: Path, track: Path, usable: Callable[[Path], bool] = lambda path: True) -> None:
+        self._data, self._track, self._usable = data, track, usable
         self._numbers: dict[tuple[str, str, Path], int] = {}
         self._entries: dict[Path, dict[str, list[ET.Element]]] = {}
         self._textures: dict[tuple[Path, Path | None, bool], int] = {}
@@ -70,7 +70,9 @@ class Materials:
         blend, layers = -1, [0, 0, 0, 0]
         if shader == "splatting" and find_file(second, folder, self._track, *texture_folders(self._data)):
             blend = self._texture(second, folder, ET.Element("material"))
-            layers = [self._texture(entry.get(f"tex-layer-{n}", ""), folder, ET.Element("material")) for n in range(2, 6)]
+            layers = [
+                self._texture(entry.get(f"tex-layer-{n}", ""), folder, ET.Element("material")) for n in range(2, 6)
+            ]
         self._rows.append((texture, shader == "unlit", blend, layers))
         self.kinds.append(_KINDS.get(shader, Kind.SOLID) if texture else Kind.SOLID)
         return len(self.kinds) - 1
@@ -93,10 +95,10 @@ class Materials:
         return self._entries[folder]
 
     def _texture(self, name: str, folder: Path, entry: ET.Element) -> int:
-        """Its number in the atlas; 0, a grey, where there is no such file."""
+        """Its number in the atlas; 0, a grey, where there is no such file, or it may not be used."""
         places = (folder, self._track, *texture_folders(self._data))
         path, mask = find_file(name, *places), find_file(entry.get("mask"), *places)
-        if path is None:
+        if path is None or not self._usable(path):
             return 0
         clamped = entry.get("clampu") == "Y" or entry.get("clampv") == "Y"
         key = (path, mask, clamped)

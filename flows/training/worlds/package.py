@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+import tempfile
 from pathlib import Path
 
-from flows.readers.base import InputError
+from flows.errors import InputError
 
 PACKAGE = "supertuxkart-data"
-_DATA, _COPYRIGHT = "usr/share/games/supertuxkart/data", f"usr/share/doc/{PACKAGE}/copyright"
+DATA, COPYRIGHT = "usr/share/games/supertuxkart/data", f"usr/share/doc/{PACKAGE}/copyright"
 
 # Never trained on: a jungle temple, a harbour at the sea, a classroom, a mansion's halls and park, a snow village,
 # a Japanese garden. None of them shares its ground or buildings with a track to train on.
@@ -23,16 +26,34 @@ TRAINING = (
 def data_folder(folder: Path) -> Path:
     """The game's data folder below `folder`, into which the package was unpacked. Raises InputError if it is not
     there."""
-    found = folder / _DATA
+    found = folder / DATA
     if not (found / "tracks").is_dir():
         raise InputError(
-            f"{folder} holds no {PACKAGE} ({_DATA}/tracks is not there). Fetch it with "
-            f"'cat3d train worlds --fetch {folder}', or by hand: apt-get download {PACKAGE} && dpkg -x "
-            f"{PACKAGE}_*.deb {folder}"
+            f"{folder} holds no {PACKAGE} ({DATA}/tracks is not there); fetch it with 'cat3d worlds {folder}'."
         )
     return found
 
 
 def copyright_file(folder: Path) -> Path:
     """The package's own list of licences."""
-    return folder / _COPYRIGHT
+    return folder / COPYRIGHT
+
+
+def fetch(folder: Path) -> None:
+    """Download the package with the ordinary Debian client and unpack it into `folder`; nothing is installed.
+
+    Raises InputError where this is no Debian (then somebody who has one can do it), or the client refuses."""
+    by_hand = f"apt-get download {PACKAGE} && dpkg -x {PACKAGE}_*.deb {folder}"
+    if shutil.which("apt-get") is None or shutil.which("dpkg") is None:
+        raise InputError(f"This machine has no apt-get and dpkg; on a Debian or Ubuntu one, run: {by_hand}")
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder) as place:
+        # Unpacked beside its place first: an interrupted fetch leaves nothing that looks complete.
+        for command in (["apt-get", "download", PACKAGE], ["dpkg", "-x", None, "unpacked"]):
+            archive = next((str(path) for path in Path(place).glob("*.deb")), "")
+            done = subprocess.run(
+                [part or archive for part in command], cwd=place, capture_output=True, text=True, check=False
+            )
+            if done.returncode:
+                raise InputError(f"{' '.join(p or archive for p in command)} failed: {done.stderr.strip()[-300:]}")
+        (Path(place) / "unpacked" / "usr").rename(folder / "usr")

@@ -90,7 +90,9 @@ def _about(
     u = (np.arange(_CANDIDATES * count) + random.uniform(0, 1, _CANDIDATES * count)) / (_CANDIDATES * count)
     azimuth = random.uniform(0, 2 * math.pi) + turn * (u - 0.5)
     base = random.uniform(0.05, rise)
-    elevation = (base + 0.12 * np.sin(azimuth * random.integers(1, 3)) + 0.06 * random.normal(size=len(u))).clip(0.03, 1.2)
+    elevation = (base + 0.12 * np.sin(azimuth * random.integers(1, 3)) + 0.06 * random.normal(size=len(u))).clip(
+        0.03, 1.2
+    )
     far = reach * (1 + random.uniform(0.02, 0.12) * random.normal(size=len(u)).clip(-2, 2))
     flat = np.cos(elevation)
     eyes = focus + far[:, None] * np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)], -1)
@@ -156,7 +158,9 @@ def look_around(world: World, random: np.random.Generator, count: int) -> Eyes |
     u = (np.arange(_CANDIDATES * count) + random.uniform(0, 1, _CANDIDATES * count)) / (_CANDIDATES * count)
     heading = random.uniform(0, 2 * math.pi) + math.radians(random.uniform(50, 200)) * (u - 0.5)
     reach = random.uniform(0.2, 0.9)
-    look = np.stack([np.cos(heading), np.sin(heading), random.uniform(-0.25, 0.05) + 0.06 * random.normal(size=len(u))], -1)
+    look = np.stack(
+        [np.cos(heading), np.sin(heading), random.uniform(-0.25, 0.05) + 0.06 * random.normal(size=len(u))], -1
+    )
     step = np.stack([look[:, 1], -look[:, 0], 0 * u], -1) * random.choice([-1, 1])
     eyes = home + reach * step * random.uniform(0.3, 1, (len(u), 1)) + 0.15 * reach * random.normal(size=look.shape)
     return _reached(world, home, eyes, eyes + 4 * look)

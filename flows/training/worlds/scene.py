@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.readers.base import InputError
+from flows.errors import InputError
 
 MAX_XML_BYTES = 64 * 2**20
 MAX_PLACEMENTS = 50_000

@@ -8,10 +8,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from flows.errors import InputError
 from flows.training.renders import save
 from flows.training.worlds.groups import Group, Studio, group
+from flows.training.worlds.licences import Licences
 from flows.training.worlds.light import Sky
-from flows.training.worlds.package import data_folder
+from flows.training.worlds.package import copyright_file, data_folder
 from flows.training.worlds.placing import KINDS
 from flows.training.worlds.scene import read_track
 from flows.training.worlds.world import World
@@ -22,10 +24,17 @@ FIRST_FAMILY = 5
 
 
 def open_track(package: Path, name: str) -> Studio:
-    """A track of the unpacked package, ready to be photographed. Raises InputError for missing or damaged files."""
-    data = data_folder(package)
+    """A track of the unpacked package, ready to be photographed, without files whose licence is not a free one.
+    Raises InputError for missing or damaged files."""
+    data, licences = data_folder(package), Licences(copyright_file(package))
+
+    def usable(path: Path) -> bool:
+        return licences.of(str(path.relative_to(data.parent))).free
+
     scene = read_track(data, name)
-    return Studio(name, World(scene, data), Sky.of(scene))
+    if scene.sky is not None and not all(usable(path) for path in scene.sky):
+        scene.sky = None
+    return Studio(name, World(scene, data, usable), Sky.of(scene))
 
 
 def as_tensors(found: Group) -> dict[str, Tensor]:
@@ -55,20 +64,29 @@ def shard_groups(studio: Studio, turn: int, views: int, size: int, seed: int) ->
 
 def world_shards(
     folder: Path, package: Path, tracks: Sequence[str], mine: Sequence[int], views: int, size: int, seed: int,
-    advance: Callable[[int], None],
-) -> list[str]:  # fmt: skip
-    """Photograph the shards `mine` that are not in `folder`/renders yet, tracks in turn. `advance` is told of groups
-    done. Returns sentences about tracks with no room at all."""
-    notes: list[str] = []
+    advance: Callable[[int], None], first: int = 0,
+) -> None:  # fmt: skip
+    """Photograph the shards `mine` that are not in `folder`/renders yet, tracks in turn; shard n becomes file
+    `first` + n. `advance` is told of groups done.
+
+    Where a track has no room for a single group, the next one takes its turn. Raises InputError where none has."""
     for shard in mine:
-        path = folder / "renders" / f"{shard:05d}.safetensors"
-        name, turn = tracks[shard % len(tracks)], shard // len(tracks)
+        path = folder / "renders" / f"{first + shard:05d}.safetensors"
         if not path.exists():
-            found = shard_groups(open_track(package, name), turn, views, size, seed)
-            if found:
-                parts = [as_tensors(one) for one in found]
-                save(path, {key: torch.stack([part[key] for part in parts]) for key in parts[0]})
-            else:
-                notes.append(f"Track {name} has no room for groups of {views} cameras; it is left out.")
+            parts = [as_tensors(one) for one in _any_groups(package, tracks, shard, views, size, seed)]
+            save(path, {key: torch.stack([part[key] for part in parts]) for key in parts[0]})
         advance(SHARD_GROUPS)
-    return notes
+
+
+def _any_groups(package: Path, tracks: Sequence[str], shard: int, views: int, size: int, seed: int) -> list[Group]:
+    for step in range(len(tracks)):
+        name = tracks[(shard + step) % len(tracks)]
+        found = shard_groups(open_track(package, name), shard // len(tracks), views, size, seed)
+        if found:
+            return found
+    raise InputError(f"{package}: none of the tracks has room for groups of {views} cameras; ask for fewer views.")
+
+
+def shard_numbers(groups: int) -> range:
+    """Shard n holds the groups from n * SHARD_GROUPS on."""
+    return range(-(-groups // SHARD_GROUPS))

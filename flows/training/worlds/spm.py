@@ -1,12 +1,12 @@
 """Meshes of SuperTuxKart (.spm, little-endian).
 
-    "SP", a byte (version << 3 | type; 1 = with a skeleton, 2 = static), a byte of flags (1 normals, 2 colours,
-    4 tangents), 6 floats (bounding box), u16 materials, each two texture names with a length byte before them,
-    u16 sectors, each u16 buffers; a buffer is u32 vertices, u32 indices, u16 material, the vertices, the indices.
-    A vertex: 3 floats; [u32 normal, 10 bits an axis]; [colour: one byte 128 (white), or another and 3 bytes];
-    [2 half floats of texture coordinates where the first texture is named, 2 more where the second is; with
-    tangents, a u32]; [16 bytes of joints where there is a skeleton]. Indices take 1, 2 or 4 bytes by the number of
-    vertices.
+"SP", a byte (version << 3 | type; 1 = with a skeleton, 2 = static), a byte of flags (1 normals, 2 colours,
+4 tangents), 6 floats (bounding box), u16 materials, each two texture names with a length byte before them,
+u16 sectors, each u16 buffers; a buffer is u32 vertices, u32 indices, u16 material, the vertices, the indices.
+A vertex: 3 floats; [u32 normal, 10 bits an axis]; [colour: one byte 128 (white), or another and 3 bytes];
+[2 half floats of texture coordinates where the first texture is named, 2 more where the second is; with
+tangents, a u32]; [16 bytes of joints where there is a skeleton]. Indices take 1, 2 or 4 bytes by the number of
+vertices.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.readers.base import InputError
+from flows.errors import InputError
 
 MAX_BYTES = 256 * 2**20
 _SKELETON, _STATIC = 1, 2
@@ -72,7 +72,9 @@ def read_spm(path: Path) -> list[Buffer]:
     kind, flags = source.numbers("BB")
     version, kind = kind >> 3, kind & 7
     if version != 1 or kind not in (_SKELETON, _STATIC):
-        raise InputError(f"{path} is an .spm mesh of version {version}, type {kind}; version 1, types 1 and 2 are read.")
+        raise InputError(
+            f"{path} is an .spm mesh of version {version}, type {kind}; version 1, types 1 and 2 are read."
+        )
     source.numbers("6f")
     materials = [(source.name(), source.name()) for _ in range(source.numbers("H")[0])]
     buffers = []
@@ -120,7 +122,9 @@ def _buffer(source: _Bytes, materials: list[tuple[str, str]], flags: int, kind: 
     if len(raw) % 3 or (len(raw) and raw.max() >= count):
         raise InputError(f"{source.path} has triangles of vertices that it doesn't hold; fetch the package again.")
     packed = column(starts + 12, "<u4", 1)[:, 0] if normals else None
-    return Buffer(points, None if packed is None else unpacked_normals(packed), rgb, uv, uv2, raw.reshape(-1, 3), textures)
+    return Buffer(
+        points, None if packed is None else unpacked_normals(packed), rgb, uv, uv2, raw.reshape(-1, 3), textures
+    )
 
 
 def _vertex_starts(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from flows.readers.base import InputError
+from flows.errors import InputError
 
 MAX_SIDE = 512
 MAX_FILE_PIXELS = 64 * 2**20

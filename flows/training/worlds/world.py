@@ -5,6 +5,7 @@ Frame: +z up, metres. Colours are linear light until `srgb_from_linear`."""
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
-from flows.readers.base import InputError
+from flows.errors import InputError
 from flows.training.worlds.materials import Kind, Materials
 from flows.training.worlds.scene import Placement, TrackScene
 from flows.training.worlds.spm import Buffer, read_spm
@@ -48,15 +49,17 @@ class Thing:
 
 class World:
     """A track's triangles with their materials. things: the objects that stand in it; ground (P, 3): where one can
-    stand; notes: sentences about what was left out."""
+    stand; files: what it is made of.
 
-    def __init__(self, scene: TrackScene, data: Path) -> None:
-        meshes, materials = _Meshes(), Materials(data, scene.folder)
-        self.notes = [f"{len(scene.missing)} names are not in the package: {', '.join(sorted(set(scene.missing)))}"]
-        self.notes = self.notes if scene.missing else []
+    usable: whether a file of the package may be used; meshes that may not are left out, textures become grey."""
+
+    def __init__(self, scene: TrackScene, data: Path, usable: Callable[[Path], bool] = lambda path: True) -> None:
+        meshes, materials = _Meshes(), Materials(data, scene.folder, usable)
         boxes: dict[int, list[NDArray[np.float64]]] = defaultdict(list)
         loaded: dict[Path, list[Buffer]] = {}
         for placement in scene.placements:
+            if not usable(placement.model):
+                continue
             if placement.model not in loaded:
                 loaded[placement.model] = read_spm(placement.model)
             for buffer in loaded[placement.model]:
@@ -215,5 +218,3 @@ def _turned(buffer: Buffer, matrix: NDArray[np.float64]) -> NDArray[np.float32]:
         return np.zeros_like(buffer.points)
     turned = buffer.normals @ np.linalg.inv(linear)
     return (turned / np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-9)).astype(np.float32)
-
-
