@@ -149,9 +149,9 @@ def rows(
     captured: Sequence[Path] = (),
     worlds: Path | None = None,
 ) -> list[dict[str, Any]]:
-    """One row per family (and "all"), captured scene, the held-out worlds of a folder, number of conditioning views and method: mean PSNR, SSIM
-    (gaussian, valid) and, where a network is given, its distance, over all target views. pictures: a folder for contact
-    sheets."""
+    """One row per family (and "all"), captured scene, the held-out worlds of a folder, number of conditioning views
+    and method: mean PSNR, SSIM (gaussian, valid) and, where a network is given, its distance, over all target views.
+    pictures: a folder for contact sheets."""
     sampler, size, views = sampler or FEW_STEPS, model.config.image_size, model.config.views
     scores: dict[tuple, list[dict[str, float]]] = defaultdict(list)
 

@@ -21,7 +21,7 @@ from flows.training.model import history, model_config, starting_config, startin
 from flows.training.prepare import claim, prepare
 from flows.training.ranks import Ranks, ranks
 from flows.training.sheets import held_out
-from flows.training.worlds.package import PACKAGE, TRAINING
+from flows.training.worlds import package as worlds
 from schemas.config import load_config, parse_config
 from schemas.errors import ConfigError
 from schemas.settings import merged, settings_document
@@ -91,7 +91,7 @@ def run_training(config: TrainRunConfig, out: Path, own: Ranks, bank_only: bool 
     origin = {
         "data": f"procedural scenes of cat3d_core.synthetic ({families})"
         + (f", textures from {textures.name}" if textures else "")
-        + (f", tracks of Debian's {PACKAGE}: {', '.join(TRAINING)}" if config.bank.worlds else ""),
+        + (f", tracks of Debian's {worlds.PACKAGE}: {', '.join(worlds.TRAINING)}" if config.bank.worlds else ""),
         "training": json.loads(config.model_dump_json()), "versions": provenance(), "ranks": own.world,
     }  # fmt: skip
     if config.start is not None:

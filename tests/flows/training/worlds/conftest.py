@@ -18,8 +18,8 @@ UV = [(0.0, 1.0), (1.0, 1.0), (1.0, 0.0), (0.0, 0.0)]
 
 
 def spm(
-    points: list[tuple[float, float, float]], texture: str = "", colors: list[tuple[int, int, int] | None] | None = None,
-    triangles: tuple[int, ...] = (0, 3, 1, 1, 3, 2),
+    points: list[tuple[float, float, float]], texture: str = "",
+    colors: list[tuple[int, int, int] | None] | None = None, triangles: tuple[int, ...] = (0, 3, 1, 1, 3, 2),
 ) -> bytes:  # fmt: skip
     """The bytes of a static mesh; a colour of None is stored as white."""
     flags = 2 if colors else 0
