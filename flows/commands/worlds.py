@@ -30,7 +30,7 @@ def worlds_command(package: Path, held_out: Path | None, groups: int, views: int
     if held_out is not None:
         with meter("photograph held-out worlds", SHARD_GROUPS * len(shard_numbers(groups))) as bar:
             make_held_out_worlds(held_out, package, groups, views, size, bar.advance)
-        console.print(f"Evaluate with: python -m flows.bench.model MODEL --worlds {held_out}")
+        console.print(f"Evaluate with: python -m flows.training.evaluation MODEL --worlds {held_out}")
 
 
 def licence_page(package: Path, advance: Callable[[int], None]) -> str:

@@ -13,8 +13,8 @@ from safetensors.torch import load_file
 from cat3d_core.cameras import Cameras
 from cat3d_core.synthetic.capture import look_at
 from cat3d_core.synthetic.tracer import Traced
-from flows.bench.model import warp
 from flows.errors import InputError
+from flows.training.evaluation import warp
 from flows.training.worlds import package as stk
 from flows.training.worlds.groups import NEARER, Studio, group, view_depth, view_light
 from flows.training.worlds.held_out import held_out_worlds
