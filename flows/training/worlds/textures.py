@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 
 from flows.errors import InputError
 
@@ -27,6 +26,8 @@ def srgb_from_linear(linear: NDArray) -> NDArray:
 def read_texture(path: Path, mask: Path | None = None, max_side: int = MAX_SIDE) -> NDArray[np.uint8]:
     """(H, W, 4) sRGB colour and opacity, reduced to sides of powers of two of at most max_side. mask: an image whose
     brightness is the opacity. Raises InputError for a file that is no image."""
+    from PIL import Image  # a training on a borrowed machine, which may lack it, reads finished renders
+
     try:
         with Image.open(path) as image:
             if image.width * image.height > MAX_FILE_PIXELS:
@@ -35,7 +36,7 @@ def read_texture(path: Path, mask: Path | None = None, max_side: int = MAX_SIDE)
         if mask is not None:
             with Image.open(mask) as opacity:
                 rgba.putalpha(opacity.convert("L").resize(rgba.size))
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path} can't be read as an image ({error}); fetch the package again.") from None
@@ -47,7 +48,7 @@ def mip_levels(image: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
     """The image (H, W, 4), sides powers of two, and its halvings down to one texel; means of linear light, weighted
     with opacity so that what is cut away does not bleed into leaves."""
     levels, alpha = [image], image[..., 3:].astype(np.float32) / 255
-    color = LINEAR_FROM_SRGB[image[..., :3]]
+    color: NDArray = LINEAR_FROM_SRGB[image[..., :3]]
     while max(levels[-1].shape[:2]) > 1:
         weight = alpha + 1e-4
         color, weight, alpha = _halved(color * weight), _halved(weight), _halved(alpha)
@@ -78,7 +79,9 @@ class Atlas:
     @staticmethod
     def of(images: list[NDArray[np.uint8]], clamped: list[bool]) -> Atlas:
         """The table of images (H, W, 4) whose sides are powers of two."""
-        parts, starts, at = [], [], 0
+        parts: list[NDArray[np.uint8]] = []
+        starts: list[list[int]] = []
+        at = 0
         for image in images:
             levels = mip_levels(image)
             starts.append([])

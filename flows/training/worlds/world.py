@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from flows.errors import InputError
+from flows.open3d_import import import_open3d
 from flows.training.worlds.materials import Kind, Materials
 from flows.training.worlds.scene import Placement, TrackScene
 from flows.training.worlds.spm import Buffer, read_spm
@@ -82,8 +82,10 @@ class World:
         area = np.linalg.norm(normal, axis=-1)
         self.face_normals = (normal / np.maximum(area, 1e-20)[:, None]).astype(np.float32)
         self.density = _texel_density(self, area)
-        self._embree = o3d.t.geometry.RaycastingScene(nthreads=1)
-        self._embree.add_triangles(o3d.core.Tensor(points), o3d.core.Tensor(self.triangles.astype(np.uint32)))
+        open3d = import_open3d("Worlds")
+        self._tensor = open3d.core.Tensor
+        self._embree = open3d.t.geometry.RaycastingScene(nthreads=1)
+        self._embree.add_triangles(self._tensor(points), self._tensor(self.triangles.astype(np.uint32)))
 
     def cast(self, origins: NDArray, directions: NDArray) -> Hits:
         """First surfaces that are not see-through at the place hit; rays (R, 3) float, directions of any length."""
@@ -92,7 +94,7 @@ class World:
         hits = Hits(np.full(count, np.inf, np.float32), np.full(count, -1), np.zeros((count, 3), np.float32))
         rows, passed, length = np.arange(count), np.zeros(count, np.float32), np.sqrt(dot(rays[:, 3:], rays[:, 3:]))
         for layer in range(MAX_LAYERS):
-            answer = self._embree.cast_rays(o3d.core.Tensor(rays[rows]))
+            answer = self._embree.cast_rays(self._tensor(rays[rows]))
             step = answer["t_hit"].numpy()
             met = np.isfinite(step)
             rows, step = rows[met], step[met]
