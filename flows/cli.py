@@ -220,6 +220,22 @@ def train(
 
 
 @app.command()
+def worlds(
+    package: Annotated[Path, typer.Argument(help="Folder for Debian's supertuxkart-data; fetched if not there yet.")],
+    held_out: Annotated[
+        Path | None, typer.Option(help="Photograph the held-out tracks into this folder, to evaluate models on.")
+    ] = None,
+    groups: Annotated[int, typer.Option(help="How many held-out groups of cameras, at least.")] = 60,
+    views: Annotated[int, typer.Option(help="Cameras of a held-out group.")] = 10,
+    size: Annotated[int, typer.Option(help="Side of their pictures in pixels.")] = 128,
+) -> None:
+    """Fetch textured worlds to train on (628 MB, nothing is installed), and list their licences."""
+    from flows.commands.worlds import worlds_command
+
+    worlds_command(package, held_out, groups, views, size)
+
+
+@app.command()
 def stress(
     quick: Annotated[bool, typer.Option("--quick", help="Under a minute: a few thousand cases a routine.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,

@@ -22,6 +22,7 @@ from pydantic import (
 )
 
 from schemas.errors import ConfigError
+from schemas.hints import HintsConfig
 from schemas.settings import spelled_out
 from schemas.skip import SkipConfig
 from schemas.strict import StrictModel as _Model
@@ -78,19 +79,6 @@ class PlanConfig(_Model):
     """Captured views take conditioning slots before anchors do."""
     wide: bool = False
     """Add the wide samples from padded squares for photos that aren't square."""
-
-
-class HintsConfig(_Model):
-    """What the photos show of the planned views, carried there by geometry before anything is sampled.
-
-    A plane sweep finds for each pixel of a planned view its depth, its colour in the photos and how far that is to be
-    trusted. The paper has no such step (docs/explanation/geometry.md).
-    """
-
-    use: Literal["auto", "always", "never"] = "auto"
-    """`auto`: with the shipped model, which was measured with them; other models go without."""
-    checkpoint: Path | None = None
-    """Weights of the plane sweep; None: the ones shipped."""
 
 
 class SampleConfig(_Model):

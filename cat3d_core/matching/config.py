@@ -39,5 +39,9 @@ class SweepConfig:
     @staticmethod
     def from_json(text: str) -> SweepConfig:
         """What `to_json` wrote."""
-        fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in json.loads(text).items()}
-        return SweepConfig(**fields)
+        return SweepConfig.from_fields(json.loads(text))
+
+    @staticmethod
+    def from_fields(fields: dict[str, Any]) -> SweepConfig:
+        """From JSON values. Raises TypeError for a field that there is not."""
+        return SweepConfig(**{name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()})

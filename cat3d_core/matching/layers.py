@@ -25,6 +25,12 @@ def resized(x: Tensor, height: int, width: int) -> Tensor:
     return out.reshape(*x.shape[:-2], height, width)
 
 
+def zeroed(layer: nn.Conv2d | nn.Conv3d) -> None:
+    """Make a layer answer 0 until it is trained."""
+    for weight in layer.parameters():
+        nn.init.zeros_(weight)
+
+
 class Residual(nn.Module):
     """x + conv(act(conv(act(norm(x))))), in 2 or 3 dimensions; starts as the identity."""
 
@@ -33,8 +39,7 @@ class Residual(nn.Module):
         kind = nn.Conv2d if dimensions == 2 else nn.Conv3d
         self.norm = nn.GroupNorm(max(1, width // 8), width)
         self.first, self.second = kind(width, width, 3, padding=1), kind(width, width, 3, padding=1)
-        nn.init.zeros_(self.second.weight)
-        nn.init.zeros_(self.second.bias)
+        zeroed(self.second)
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.second(F.silu(self.first(F.silu(self.norm(x)))))

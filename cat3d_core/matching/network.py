@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from cat3d_core.matching.composite import Composite
 from cat3d_core.matching.config import SweepConfig
-from cat3d_core.matching.layers import UNet, conv, resized
+from cat3d_core.matching.layers import UNet, conv, resized, zeroed
 from cat3d_core.matching.photos import Encoder, Observed, PhotoDepth
 from cat3d_core.matching.planes import inverse_depth_of
 from cat3d_core.matching.targets import TargetDepth
@@ -50,8 +50,7 @@ class Finish(nn.Module):
         width = config.finish[0]
         self.enter, self.unet, self.leave = conv(6 + hints, width), UNet(config.finish), conv(width, 3)
         self.sure = nn.Sequential(conv(hints + width, 24), nn.SiLU(), conv(24, 16), nn.SiLU(), conv(16, 1))
-        nn.init.zeros_(self.leave.weight)
-        nn.init.zeros_(self.leave.bias)
+        zeroed(self.leave)
 
     def forward(self, blended: Tensor, nearest: Tensor, hints: Tensor) -> tuple[Tensor, Tensor]:
         x = self.unet(self.enter(torch.cat([blended * 2 - 1, nearest * 2 - 1, hints], 1)))

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from cat3d_core.matching.config import SweepConfig
-from cat3d_core.matching.layers import Residual, UNet, conv, resized
+from cat3d_core.matching.layers import Residual, UNet, conv, resized, zeroed
 from cat3d_core.matching.planes import inverse_depth_of, local_mean
 from cat3d_core.matching.warp import Views, pair_maps, project, take
 
@@ -55,6 +55,8 @@ class Encoder(nn.Module):
 class PhotoDepth(nn.Module):
     """Sweep of each photo's frustum through its partners, and what its own picture suggests."""
 
+    planes: Tensor
+
     def __init__(self, config: SweepConfig) -> None:
         super().__init__()
         self.config = config
@@ -67,9 +69,9 @@ class PhotoDepth(nn.Module):
         self.place = nn.Parameter(torch.zeros(planes, width))
         self.volume = UNet(config.volume, 3)
         self.score = nn.Conv3d(width, 1, 3, padding=1)
-        self.finer = nn.Sequential(conv(half + width + 4, 32), Residual(32), Residual(32), nn.SiLU(), conv(32, 2))
-        nn.init.zeros_(self.finer[-1].weight)
-        nn.init.constant_(self.finer[-1].bias, 0.0)
+        last = conv(32, 2)
+        zeroed(last)
+        self.finer = nn.Sequential(conv(half + width + 4, 32), Residual(32), Residual(32), nn.SiLU(), last)
         t = torch.linspace(0, 1, planes)
         self.register_buffer("planes", inverse_depth_of(t, config.nearest), persistent=False)
 

@@ -152,8 +152,8 @@ class TargetDepth(nn.Module):
     @staticmethod
     def _read(volume: Tensor, share: Tensor) -> Tensor:
         """The coarse volume at the hypotheses: (N, C, D, h, w), (N, K, H, W) -> (N, C, K, H, W)."""
-        planes = volume.shape[2]
-        xy = pixel_grid(*share.shape[-2:], share.device)
+        planes, (height, width) = volume.shape[2], share.shape[-2:]
+        xy = pixel_grid(height, width, share.device)
         z = (share * 2 - 1) * (planes - 1) / planes
         grid = torch.stack([xy[0].expand_as(z), xy[1].expand_as(z), z], -1)
         return F.grid_sample(volume.float(), grid, padding_mode="border", align_corners=False)

@@ -1,4 +1,4 @@
-"""The plane sweep on the scenes of `flows/bench/model.py`: held-out procedural scenes and captured ones.
+"""The plane sweep on the scenes of `flows/training/evaluation.py`: held-out procedural scenes and captured ones.
 
 For each target view of a group of 8 (M given, 8 - M targets), against its exact render or photograph:
   nearest      the nearest given view, copied
@@ -24,6 +24,8 @@ from torch import Tensor
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.diffusion import load_model
+from cat3d_core.generation import Cat3dGenerator
+from cat3d_core.generation.advice import FEW_STEPS
 from cat3d_core.matching.checkpoint import load_sweep
 from cat3d_core.matching.composite import Composite
 from cat3d_core.matching.hint import Hint, hint, observe
@@ -32,16 +34,9 @@ from cat3d_core.metrics.perceptual import PerceptualDistance, find_perceptual
 from cat3d_core.metrics.psnr import psnr
 from cat3d_core.metrics.ssim import ssim
 from cat3d_core.synthetic import FAMILIES
+from cat3d_core.synthetic.held_out import held_out_group
 from cat3d_core.weights import default_model_path
-from flows.bench.model import (
-    ALL_CAPTURED,
-    FEW_STEPS,
-    captured_group,
-    captured_scenes,
-    evaluate_group,
-    held_out_group,
-    warped,
-)  # fmt: skip
+from flows.training.evaluation import ALL_CAPTURED, captured_group, captured_scenes, evaluate_group, warped
 from flows.training.renders import save
 
 SIZE, VIEWS = 128, 8
@@ -91,7 +86,7 @@ def sampled(image: Tensor, cameras: Cameras, given: int, key: tuple) -> dict[str
     if not _MODEL:
         model = load_model(default_model_path())
         model.unet = model.unet.to(torch.bfloat16)
-        _MODEL.append(model)
+        _MODEL.append(Cat3dGenerator(model))
     images = evaluate_group(_MODEL[0], image, cameras, given, FEW_STEPS, key)
     return {name: images[name].half() for name in ("sample", "nearest")} | {
         "image": image, "intrinsics": cameras.intrinsics, "world_from_camera": cameras.world_from_camera,

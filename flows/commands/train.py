@@ -22,6 +22,7 @@ from flows.training.prepare import claim, prepare
 from flows.training.ranks import Ranks, ranks
 from flows.training.sheets import held_out
 from flows.training.sweep import train_sweep
+from flows.training.worlds import package as worlds
 from schemas.config import load_config, parse_config
 from schemas.errors import ConfigError
 from schemas.settings import merged, settings_document
@@ -101,7 +102,8 @@ def run_training(config: TrainRunConfig, out: Path, own: Ranks, bank_only: bool 
     families, textures = ", ".join(config.bank.families), config.bank.textures
     origin = {
         "data": f"procedural scenes of cat3d_core.synthetic ({families})"
-        + (f", textures from {textures.name}" if textures else ""),
+        + (f", textures from {textures.name}" if textures else "")
+        + (f", tracks of Debian's {worlds.PACKAGE}: {', '.join(worlds.TRAINING)}" if config.bank.worlds else ""),
         "training": json.loads(config.model_dump_json()), "versions": provenance(), "ranks": own.world,
     }  # fmt: skip
     if config.start is not None:

@@ -82,7 +82,7 @@ def train_sweep(config: SweepRunConfig, out: Path, own: Ranks, bank_only: bool =
 def starting_network(config: SweepRunConfig) -> SweepNetwork:
     """A new network, or the weights of `start`. Raises ConfigError where those are of another network."""
     try:
-        wanted = SweepConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in config.network.items()})
+        wanted = SweepConfig.from_fields(config.network)
     except TypeError as error:
         raise ConfigError(f"network: {error}.") from None
     torch.manual_seed(config.seed)

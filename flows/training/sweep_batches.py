@@ -152,7 +152,7 @@ def batch(
     bank: GeometryBank, scenes: int, photos: int, targets: int, size: int, spread: float, random: torch.Generator
 ) -> SweepBatch:
     """One batch for training; photos + targets views of each scene."""
-    parts = []
+    parts: list[Scene] = []
     while len(parts) < scenes:
         raw = bank.draw(random)
         if len(raw["image"]) >= photos + targets:

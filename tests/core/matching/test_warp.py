@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from flows.bench.model import held_out_group, warped
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -12,6 +11,8 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.matching.warp import pair_maps, pixel_grid, project, take, views
 from cat3d_core.metrics.psnr import psnr
 from cat3d_core.rays import image_rays
+from cat3d_core.synthetic.held_out import held_out_group
+from flows.training.evaluation import warped
 from tests.core.strategies import orbit, seeds
 
 WIDTH, HEIGHT = 24, 16
@@ -90,7 +91,7 @@ def test_reading_is_bilinear_between_pixel_centres() -> None:
 
 @pytest.mark.slow
 def test_true_depth_through_the_warp_gives_the_model_cards_row() -> None:
-    """The same picture as `flows/bench/model.py` makes with its own projection, on a scene of two families."""
+    """The same picture as `flows/training/evaluation.py` makes with its own projection, on a scene of two families."""
     for family in ("llff", "mip360"):
         traced, cameras = held_out_group(family, 0, 64)
         card = warped(traced, cameras, 3)
