@@ -17,14 +17,14 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
-from flows.commands.run import make_config
-from flows.jobs.job import Job, Request
+from flows.jobs.job import Job
+from flows.jobs.request import Request, make_config
 from flows.pipeline.keys import Step, stages_of
 from flows.pipeline.runner import execute_stage, opened, run_missing
 from flows.readers import read_capture
+from flows.reconstruction.stored import Checkpoint
 from flows.reporting.report import write_report
 from flows.reporting.summary import number, summary_rows
-from flows.stages.reconstruct import Checkpoint
 from schemas.layout import LAYOUT, SCENE_STAGES
 from schemas.scene_store import SceneStore
 from schemas.skip import SkipConfig
@@ -69,7 +69,7 @@ def sources(data: Path | None, real: Sequence[str] = REAL) -> Iterator[tuple[str
 
 
 def longer_side(scene: Path) -> int:
-    """Of the first view, in pixels."""
+    """The longer side of the scene's first photo, in pixels."""
     from flows.media.images import image_size
 
     return max(image_size(read_capture(scene).paths[0]))

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from cat3d_core.cameras import Cameras
+from cat3d_core.reconstruction import Reconstructor
 from cat3d_core.trajectories import RECIPES, Shift, choose_recipe, scene_frame
-from cat3d_core.zipnerf import Field, render_image
 from flows.jobs.access import read_cameras, views_with_role, write_cameras
 from flows.jobs.job import Job, Outcome
 from flows.jobs.stage import Stage, settings_of
@@ -18,7 +18,7 @@ from flows.media import images
 from flows.media.pictures import depth_picture
 from flows.media.video import write_video
 from flows.progress import Meter, meter
-from flows.stages.reconstruct import read_field
+from flows.reconstruction.stored import read_reconstruction
 from schemas.content_key import array_digest, content_key
 from schemas.decisions import skipped
 from schemas.scene_store import Run, SceneStore, Section
@@ -35,7 +35,7 @@ def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     """Write `renders/test` and `renders/path`: image, depth, opacity per view, each view recorded when it is done."""
     run = store.run(job.run)
-    field = read_field(job, run)
+    scene = read_reconstruction(store, run)
     settings = job.config.render
     test = views_with_role(store, run, "test") if settings.test_views else []
     captured = read_cameras(store.captured)
@@ -48,7 +48,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     rendered, rays = 0, 0
     with meter(f"render {job.scene_id} {job.run}", total) as progress:
         for kind, cameras, views in jobs:
-            made = render_views(run.renders(kind), field, cameras, views, _field_key(job, store), progress)
+            made = render_views(run.renders(kind), scene, cameras, views, _field_key(job, store), progress)
             rendered, rays = rendered + len(made), rays + sum(made)
     if rendered < total:
         text = f"Skipped {total - rendered} of {total} renders: they are of this field and these cameras."
@@ -64,7 +64,7 @@ def _field_key(job: Job, store: SceneStore) -> str:
 
 
 def render_views(
-    section: Section, field: Field, cameras: Cameras, views: list[int], key: str, progress: Meter
+    section: Section, scene: Reconstructor, cameras: Cameras, views: list[int], key: str, progress: Meter
 ) -> list[int]:
     """Render the cameras that are not done yet under `key`; the number of rays cast for each that was rendered."""
     width, height = (int(s) for s in cameras.size.max(0).values)
@@ -82,7 +82,7 @@ def render_views(
         if done[i]:
             progress.advance()
             continue
-        out = render_image(field, cameras.to(dtype=torch.float32), i)
+        out = scene.render(cameras, i)
         section.write_images("image", [images.to_uint8(out.image)], [i])
         for name, values in (("depth", out.depth), ("opacity", out.opacity)):
             padded = np.zeros((1, height, width), np.float32)

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from flows.jobs.metric_table import metric_table
 from flows.pipeline.sweep import open_jobs, run_sweep, sweep_jobs
 from schemas.config import SweepConfig, load_config
-from schemas.tables import METRICS, TIMINGS, read_rows
+from schemas.tables import TIMINGS, read_rows
 
 FIXTURE = Path(__file__).parents[2] / "fixtures" / "sweep_of_0888913.tar.gz"
 
@@ -26,8 +27,8 @@ def test_a_sweep_of_commit_0888913_is_not_redone(tmp_path: Path, monkeypatch: py
     assert [job.run for jobs in scenes for job in jobs] == ["v3-zipnerf", "v3-cat3d"]
     assert [open_jobs(jobs) for jobs in scenes] == [[]]
     executed = read_rows(out / "timings", TIMINGS).num_rows
-    metrics = read_rows(out / "metrics", METRICS).to_pylist()
+    metrics = read_rows(out / "metrics", metric_table()).to_pylist()
     assert run_sweep(config, out) == []
     assert read_rows(out / "timings", TIMINGS).num_rows == executed
-    assert read_rows(out / "metrics", METRICS).to_pylist() == metrics
+    assert read_rows(out / "metrics", metric_table()).to_pylist() == metrics
     assert os.path.getsize(out / "report.html") > 0

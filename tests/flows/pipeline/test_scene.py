@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flows.commands.run import make_config
-from flows.jobs.job import Request
+from flows.jobs.metric_table import metric_table
+from flows.jobs.request import Request, make_config
 from flows.pipeline.keys import pending
 from schemas.scene_store import SceneStore
-from schemas.tables import METRICS, TIMINGS, read_rows
+from schemas.tables import TIMINGS, read_rows
 from tests.flows.conftest import ROOT, SCENE, TINY, command, environment
 
 RUN = "v3-zipnerf"
@@ -50,7 +50,7 @@ def test_one_command_leaves_a_store_metrics_pictures_and_a_report(finished: Path
     store = store_of(finished)
     assert [s for s in STAGES if store.record(s, RUN)] == STAGES
     assert store.captured.read("image").shape == (9, 24, 32, 3)
-    rows = read_rows(finished / "metrics", METRICS).to_pylist()
+    rows = read_rows(finished / "metrics", metric_table()).to_pylist()
     assert sorted(r["view"] for r in rows) == [0, 8]
     assert all(r["protocol"] == "google" and 5 < r["psnr_db"] < 60 and r["ssim"] <= 1 for r in rows)
     pictures = {p.name for p in (finished / "procedural_dtu_3" / RUN).iterdir()}

@@ -11,17 +11,20 @@ import torch
 from cat3d_core.cameras import Cameras
 from cat3d_core.diffusion import GuidanceConfig, SamplerConfig, sample
 from cat3d_core.plan import PlanConfig, make_plan
-from cat3d_core.zipnerf import ReconstructConfig, Trainer, Views
-from flows.commands.run import make_config
+from cat3d_core.reconstruction import Views
+from cat3d_core.zipnerf import Trainer, ZipNerfConfig
+from cat3d_core.zipnerf.settings import config_from_document, fitted, left_out
 from flows.generation.groups import StoredPlan
 from flows.generation.model import shared_model
 from flows.jobs.access import read_cameras, read_images
-from flows.jobs.job import Job, Request
+from flows.jobs.job import Job
+from flows.jobs.request import Request, make_config
 from flows.media.images import to_uint8
 from flows.pipeline.keys import expected_steps
+from flows.reconstruction.open import open_reconstructor
+from flows.reconstruction.stored import read_reconstruction
 from flows.reporting.inspect import inspect_store
 from flows.stages import sample as sample_stage
-from flows.stages.reconstruct import fitted, read_field, trainer_config
 from flows.stages.sample import group_sampler, network_inputs
 from flows.stages.training_views import generated_views, training_views
 from schemas.config import parse_config
@@ -47,6 +50,10 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def job(out: Path, model: Path, *settings: str, split: str = "3") -> Job:
     texts = ["method=cat3d", f"sample.checkpoint={model}", "sample.steps=4", f"plan.views={VIEWS}", SMALL, *settings]
     return Request(SOURCE, out, (split,), make_config({}, None, texts)).jobs()[0]
+
+
+def trainer_config(job: Job) -> ZipNerfConfig:
+    return config_from_document(open_reconstructor(job).settings["trainer"])
 
 
 def field_of(job: Job) -> dict[str, np.ndarray]:
@@ -123,11 +130,12 @@ def test_without_skips_every_stage_is_the_plain_core_bit_for_bit(model: Path, tm
     assert len(made) == VIEWS
     cameras = Cameras.cat([captured, *(camera for camera, _ in made)])
     images = [*read_images(store.captured, train), *(image for _, image in made)]
-    trainer = Trainer(trainer_config(one), Views(cameras, images, torch.arange(len(cameras)) < 3), one.config.seed)
+    views = Views.from_images(cameras, images, torch.arange(len(cameras)) < 3)
+    trainer = Trainer(trainer_config(one), views, one.config.seed)
     while not trainer.finished:
         trainer.step()
     for name, value in trainer.field.state_dict().items():
-        assert torch.equal(value, read_field(one, run).state_dict()[name]), name
+        assert torch.equal(value, read_reconstruction(store, run).tensors()[name]), name
 
 
 def _points(store: SceneStore) -> torch.Tensor | None:
@@ -240,11 +248,11 @@ def test_generated_views_are_no_finer_than_the_photos_and_it_is_said(model: Path
     one = job(tmp_path, model, "skip=none")
     run_stages(one, *UP_TO_FIELD[:-1])
     store = SceneStore.open(one.store_path)
-    whole, share, told = training_views(one, store, store.run(one.run))
-    assert (share, told) == (0.0, [])
+    whole, told = training_views(one, store, store.run(one.run))
+    assert (left_out(whole), told) == (0.0, [])
     assert whole.size[3:].tolist() == [[64, 64]] * VIEWS
-    reduced, _, told = training_views(job(tmp_path, model, "skip={detail: true}"), store, store.run(one.run))
-    assert told[0].startswith(f"{VIEWS} of {VIEWS} generated views were reduced to ")
+    reduced, told = training_views(job(tmp_path, model, "skip={detail: true}"), store, store.run(one.run))
+    assert told[0].text.startswith(f"{VIEWS} of {VIEWS} generated views were reduced to ")
     assert len(reduced) == len(whole) == 3 + VIEWS
     assert torch.equal(reduced.size[:3], whole.size[:3])
     assert bool((reduced.size[3:] < 64).all())
@@ -256,13 +264,16 @@ def test_what_captured_views_show_is_not_learned_from_generated_ones(model: Path
     records = run_stages(one, *UP_TO_FIELD)
     told = next(d for d in texts(records["reconstruct"]) if "captured views show their" in d)
     store = SceneStore.open(one.store_path)
-    views, share, _ = training_views(one, store, store.run(one.run))
+    views, _ = training_views(one, store, store.run(one.run))
+    share = left_out(views)
     assert 0.05 < share < 0.95
     assert told.startswith(f"{share:.0%} of the pixels")
     counting = views.counting
     assert torch.equal(counting[:3], views.size[:3].prod(-1)), "captured pixels all count"
     assert int(counting[3:].sum()) == pytest.approx((1 - share) * int(views.size[3:].prod(-1).sum()), abs=1)
-    assert fitted(one, trainer_config(one), views, 0.9)[0].captured_share == 0.9
+    most = views.only(views.captured.repeat_interleave(views.size.prod(-1)) | (torch.rand(len(views.pixels)) < 0.1))
+    assert left_out(most) > 0.85
+    assert fitted(trainer_config(one), most, {})[0].captured_share == left_out(most)
     single = job(tmp_path / "single", model, "skip={seen: true}", split="1")
     told_of_one = texts(run_stages(single, *UP_TO_FIELD)["reconstruct"])
     assert not any("captured views show" in d for d in told_of_one), "one view alone has no depth"
@@ -274,11 +285,13 @@ def test_training_fits_what_there_is_to_train_on(model: Path, tmp_path: Path) ->
         count, side = captured + generated, 32
         poses = torch.eye(4, dtype=torch.float64).expand(count, 4, 4)
         cameras = Cameras(torch.eye(3, dtype=torch.float64).expand(count, 3, 3), poses, torch.full((count, 2), side))
-        return Views(cameras, [torch.zeros(side, side, 3, dtype=torch.uint8)] * count, torch.arange(count) < captured)
+        return Views.from_images(
+            cameras, [torch.zeros(side, side, 3, dtype=torch.uint8)] * count, torch.arange(count) < captured
+        )
 
-    def chosen(given: Views, *settings: str) -> ReconstructConfig:
+    def chosen(given: Views, *settings: str) -> ZipNerfConfig:
         one = job(tmp_path, model, "reconstruct.overrides={}", *settings)
-        return fitted(one, trainer_config(one), given)[0]
+        return fitted(trainer_config(one), given, one.config.skip.model_dump(), one.config.reconstruct.overrides)[0]
 
     few, both, dense = views(3, 0), views(3, 80), views(20, 0)
     assert chosen(few).batch_rays == 256, "a 24th of 3,072 pixels is less than the least"
