@@ -44,4 +44,5 @@ class SweepConfig:
     @staticmethod
     def from_fields(fields: dict[str, Any]) -> SweepConfig:
         """From JSON values. Raises TypeError for a field that there is not."""
-        return SweepConfig(**{name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()})
+        values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()}
+        return SweepConfig(**values)

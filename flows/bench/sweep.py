@@ -23,8 +23,6 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.diffusion import load_model
-from cat3d_core.generation import Cat3dGenerator
 from cat3d_core.generation.advice import FEW_STEPS
 from cat3d_core.matching.checkpoint import load_sweep
 from cat3d_core.matching.composite import Composite
@@ -36,6 +34,7 @@ from cat3d_core.metrics.ssim import ssim
 from cat3d_core.synthetic import FAMILIES
 from cat3d_core.synthetic.held_out import held_out_group
 from cat3d_core.weights import default_model_path
+from flows.generation.formats import cat3d
 from flows.training.evaluation import ALL_CAPTURED, captured_group, captured_scenes, evaluate_group, warped
 from flows.training.renders import save
 
@@ -84,9 +83,7 @@ _MODEL: list[Any] = []
 def sampled(image: Tensor, cameras: Cameras, given: int, key: tuple) -> dict[str, Tensor]:
     """`sample` and `nearest`, with the shipped model, which is loaded when it is first needed."""
     if not _MODEL:
-        model = load_model(default_model_path())
-        model.unet = model.unet.to(torch.bfloat16)
-        _MODEL.append(Cat3dGenerator(model))
+        _MODEL.append(cat3d.load(default_model_path(), torch.device("cpu"), "bfloat16"))
     images = evaluate_group(_MODEL[0], image, cameras, given, FEW_STEPS, key)
     return {name: images[name].half() for name in ("sample", "nearest")} | {
         "image": image, "intrinsics": cameras.intrinsics, "world_from_camera": cameras.world_from_camera,
