@@ -83,7 +83,7 @@ _MODEL: list[Any] = []
 def sampled(image: Tensor, cameras: Cameras, given: int, key: tuple) -> dict[str, Tensor]:
     """`sample` and `nearest`, with the shipped model, which is loaded when it is first needed."""
     if not _MODEL:
-        _MODEL.append(cat3d.load(default_model_path(), torch.device("cpu"), "bfloat16"))
+        _MODEL.append(cat3d.load(default_model_path(), "cpu", "bfloat16"))
     images = evaluate_group(_MODEL[0], image, cameras, given, FEW_STEPS, key)
     return {name: images[name].half() for name in ("sample", "nearest")} | {
         "image": image, "intrinsics": cameras.intrinsics, "world_from_camera": cameras.world_from_camera,
