@@ -91,13 +91,15 @@ def plan(
 @app.command()
 def inspect(
     store: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder).")],
+    array: Annotated[str | None, typer.Argument(help="One of its arrays, such as captured/image.")] = None,
+    png: Annotated[Path | None, typer.Option(help="Draw that array (images, depth, latents) or runs/RUN/plan.")] = None,
     verify: Annotated[bool, typer.Option("--verify", help="Read every chunk and check it.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
 ) -> None:
-    """What a store holds: arrays, stages done, cameras, what is stale."""
+    """What a store holds: arrays, stages done, cameras, what is stale; or one array with its statistics."""
     from flows.commands.inspect import inspect_command
 
-    inspect_command(store, verify, as_json)
+    inspect_command(store, array, verify, as_json, png)
 
 
 @app.command()
