@@ -87,11 +87,7 @@ def test_a_stranger_adds_a_stage_by_a_module_its_arrays_and_a_line(tmp_path: Pat
     for path, before, after in (
         ("flows/stages/__init__.py", "    ingest.STAGE,\n", "    ingest.STAGE,\n    brightness.STAGE,\n"),
         ("flows/stages/__init__.py", "import decode,", "import brightness, decode,"),
-        (
-            "schemas/layout.py",
-            "LAYOUT: tuple[ArraySpec, ...] = (\n",
-            f"LAYOUT: tuple[ArraySpec, ...] = (\n    {ARRAY}\n",
-        ),
+        ("schemas/layout.py", TABLE, f"{TABLE}    {ARRAY}\n"),
     ):
         text = (tmp_path / path).read_text()
         assert text.count(before) == 1, path
