@@ -31,21 +31,30 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
     out = tmp_path_factory.mktemp("skipped")
     model = random_model(out / "tiny.safetensors")
 
-    def run(label: str, until: str, *settings: str) -> Job:
-        texts = [f"label={label}", "method=cat3d", f"sample.checkpoint={model}", "sample.guidance=3", TRAINING]
-        config = make_config({}, None, [*texts, "plan.views=20", *settings])
+    def run(label: str, until: str, switches: dict[str, bool], *settings: str) -> Job:
+        skip = ", ".join(f"{name}: {str(on).lower()}" for name, on in switches.items())
+        texts = [
+            f"skip={{{skip}}}",
+            f"label={label}",
+            "method=cat3d",
+            f"sample.checkpoint={model}",
+            "sample.guidance=3",
+            TRAINING,
+        ]
+        config = make_config({}, None, [*texts, "sample.guidance=3", "plan.views=20", *settings])
         [job] = Request("procedural:dtu/3?views=9&width=64&height=48", out, ("3",), config).jobs()
         with opened(job):
             run_missing(job, until=until)
         return job
 
+    every, none = (dict.fromkeys(SkipConfig.model_fields, on) for on in (True, False))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sample_stage, "NEAR", 1e9)
-        run("most", "reconstruct", "skip=all", "skip.rounds=false")
+        run("most", "reconstruct", every | {"rounds": False})
         patch.setattr("flows.generation.rounds.BRIEF_FLOPS", 0.0)
-        run("rounds", "sample", "skip=none", "skip.rounds=true", "sample.steps=2")
+        run("rounds", "sample", none | {"rounds": True}, "sample.steps=2")
         patch.setattr(plan_stage, "COVERED_SHARE", 0.0)
-        job = run("covered", "plan", "skip=none", "skip.covered_path=true")
+        job = run("covered", "plan", none | {"covered_path": True})
     write_report(out)
     assert "Skipped, and what it saved" in (out / "report.html").read_text()
     return skipped_work([scene_section(out, job.store_path)])
