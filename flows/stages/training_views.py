@@ -42,7 +42,7 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
         images += [image for _, image in made]
         if not made:
             text = "Trained on captured views alone, without the LPIPS loss: no view was generated."
-            decisions.append(skipped(text, "covered_path"))
+            decisions.append(skipped(text))
     captured = torch.arange(len(cameras)) < len(train)
     views, more = unseen_alone(job, Views.from_images(cameras, images, captured))
     return views, decisions + more
