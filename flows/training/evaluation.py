@@ -22,8 +22,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.diffusion import SamplerConfig, load_model
-from cat3d_core.generation import Cat3dGenerator, Generator, generate
+from cat3d_core.diffusion import SamplerConfig
+from cat3d_core.generation import Generator, generate
 from cat3d_core.generation.advice import FEW_STEPS, MANY_STEPS
 from cat3d_core.metrics.perceptual import PerceptualDistance, find_perceptual
 from cat3d_core.metrics.psnr import psnr
@@ -37,6 +37,7 @@ from cat3d_core.synthetic.held_out import held_out_group
 from cat3d_core.synthetic.tracer import Traced
 from cat3d_core.view_selection import camera_distance
 from flows.errors import InputError
+from flows.generation.formats import cat3d
 from flows.jobs.device import device
 from flows.media.images import read_image, square_image, write_png
 from flows.readers.base import read_capture
@@ -197,10 +198,9 @@ def evaluate_file(
 ) -> str:
     """Markdown tables of PSNR, SSIM and (where weights are found) perceptual distance of a model file."""
     perceptual = find_perceptual()
-    model = load_model(path).to(device())
-    model.unet = model.unet.to(torch.bfloat16)
+    generator = cat3d.load(path, device(), "bfloat16")
     result = rows(
-        Cat3dGenerator(model), scenes, sampler=sampler, perceptual=perceptual, pictures=pictures,
+        generator, scenes, sampler=sampler, perceptual=perceptual, pictures=pictures,
         captured=captured_scenes(data),
     )  # fmt: skip
     return "\n\n".join(table(result, m) for m in ("psnr", "ssim", *([perceptual.name] if perceptual else [])))
