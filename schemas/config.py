@@ -34,6 +34,8 @@ class IngestConfig(_Model):
     """Divide width and height by this."""
     max_pixels: PositiveInt = 100_000_000
     """Refuse larger source images, in pixels."""
+    frames: Annotated[int, Field(ge=2)] = 60
+    """Frames taken of a video: the sharpest of each of as many equal stretches."""
 
 
 class PosesConfig(_Model):

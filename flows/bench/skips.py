@@ -69,7 +69,7 @@ def sources(data: Path | None, real: Sequence[str] = REAL) -> Iterator[tuple[str
 
 def longer_side(scene: Path) -> int:
     """Of the first view, in pixels."""
-    from flows.media.images import image_size
+    from flows.media.files import image_size
 
     return max(image_size(read_capture(scene).paths[0]))
 

@@ -6,7 +6,6 @@ Keys follow from the inputs alone, so what is stale is known before anything run
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,9 +15,10 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel, ConfigDict
 
 from flows.errors import InputError
+from flows.names import source_text
 from flows.readers.base import Capture, read_capture
 from schemas.config import RunConfig
-from schemas.content_key import array_digest, content_key
+from schemas.content_key import array_digest, content_key, file_sha256
 from schemas.errors import MissingError
 from schemas.layout import SCENE_STAGES, STAGES
 from schemas.scene_store import SceneStore
@@ -77,7 +77,7 @@ class Job(BaseModel):
 
     def capture(self) -> Capture:
         """The scene as its reader finds it now."""
-        return read_capture(self.source, self.reader, self.image_folder)
+        return read_capture(self.source, self.reader, self.image_folder, frames=self.config.ingest.frames)
 
     def split(self, capture: Capture) -> dict[str, list[int]]:
         """Training and test indices of this run. Raises InputError when the scene has no such split."""
@@ -118,9 +118,9 @@ def make_jobs(
     image_folder: str | None = None,
 ) -> tuple[Capture, list[Job]]:
     """Read the scene and make one job per split. Raises InputError for bad input or an unknown split."""
-    capture = read_capture(source, reader, image_folder)
+    capture = read_capture(source, reader, image_folder, frames=config.ingest.frames)
     job = Job(
-        source=str(source),
+        source=source_text(str(source)),
         reader=reader,
         image_folder=image_folder,
         out=out,
@@ -178,6 +178,7 @@ def expected_steps(job: Job, capture: Capture, digests: dict[str, Any] | None = 
 def stage_config(config: RunConfig, stage: str) -> dict[str, Any]:
     """The settings that can change the stage's result, as plain JSON values."""
     document = config.model_dump(mode="json")
+    document["ingest"].pop("frames")  # the digests of a video's frames cover it
     document["sample"].pop("checkpoint")  # the hash of its weights is an input of the stages that use them
     own = {} if stage in ("encode", "decode") else document[stage]
     if stage in ("plan", "poses", "sample", "reconstruct"):
@@ -239,22 +240,23 @@ def capture_digests(capture: Capture) -> dict[str, Any]:
     def digest(tensor: Any) -> str | None:
         return None if tensor is None else array_digest(tensor.numpy())
 
+    # Only where they say something, so that the keys of all other scenes stay what they were.
+    unusual: dict[str, Any] = {} if capture.upright else {"upright": False}
+    if capture.fisheye is not None:
+        unusual["fisheye"] = digest(capture.fisheye)
+    if capture.mask_training:
+        unusual["mask_training"] = True
     return {
         "images": images,
         "lens": {
             "intrinsics": digest(cameras.intrinsics) if cameras else None,
             "distortion": digest(capture.distortion),
             "masks": masks,
-        },
+        }
+        | unusual,
         "cameras": {
             "poses": digest(cameras.world_from_camera) if cameras else None,
             "points": digest(capture.points),
             "depth_bounds": digest(capture.depth_bounds),
         },
     }
-
-
-def file_sha256(path: Path) -> str:
-    """sha256 of a file's bytes, hexadecimal."""
-    with open(path, "rb") as f:
-        return hashlib.file_digest(f, "sha256").hexdigest()
