@@ -204,9 +204,8 @@ def _others(path: Path, chosen: str) -> list[str]:
     """A note for each other description of the scene in the same folder."""
     same = {"reconfusion", "transforms"}
     names = [n for n in READERS if n not in (chosen, "photos", *(same if chosen in same else ()))]
-    modules = [(n, importlib.import_module(f"flows.readers.{n}")) for n in names]
     return [
-        f"The reader {chosen} was used. The folder also has {module.LOOKS_FOR}: --reader {name} reads that instead."
-        for name, module in modules
-        if module.detect(path)
+        f"The reader {chosen} was used. The folder also fits the reader {name}: --reader {name} takes that instead."
+        for name in names
+        if importlib.import_module(f"flows.readers.{name}").detect(path)
     ]

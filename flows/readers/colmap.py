@@ -49,7 +49,7 @@ def read(path: Path, image_folder: str | None, view_counts: tuple[int, ...]) -> 
     paths = [file for _, file in found]
     unregistered = left_out(folder.root, paths, root) if folder.root != root else []
     if unregistered:
-        notes.append(unlisted_note(len(unregistered), f"images in {folder.root.name} without a pose were", unregistered))
+        notes.append(unlisted_note(len(unregistered), f"photos of the folder {folder.root.name} have no pose and were", unregistered))
     if folder.root.name != "images" and folder.root != root:
         notes.append(f"Images are those of {folder.root.name}; --images takes another folder.")
     names = [image.name.replace("\\", "/") for image, _ in found]

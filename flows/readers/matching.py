@@ -56,8 +56,9 @@ class Finder:
         parts = split_name(name)
         if not _is_absolute(name) and parts and parts[0] != "..":
             found = self._at(self.root, parts)
-            if found is not None and str(found.relative_to(self.root)) != os.path.join(*parts):
-                self.respelled[name] = str(found.relative_to(self.root))
+            known = None if found is None else str(found.relative_to(self.root))
+            if known is not None and os.path.join(*parts) not in (known, str(Path(known).with_suffix(""))):
+                self.respelled[name] = known
             return found
         found = self._inside(name) or self._by_tail(parts)
         if found is None:

@@ -13,7 +13,7 @@ from cat3d_core.zipnerf import Views
 from flows.generation.brief import LEAST, shown_by_captured
 from flows.media.images import resize
 from flows.pipeline.jobs import Job
-from flows.stages.common import read_cameras, read_images, views_with_role
+from flows.stages.common import read_cameras, read_images, read_masks, views_with_role
 from schemas.scene_store import Run, SceneStore
 
 
@@ -44,7 +44,11 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, float,
         if not made:
             decisions.append("Trained on captured views alone, without the LPIPS loss: no view was generated.")
     captured = torch.arange(len(cameras)) < len(train)
-    views, share, told = unseen_alone(job, Views(cameras, images, captured))
+    masks = read_masks(store, train)
+    if masks is not None:
+        masks += [None] * (len(cameras) - len(train))
+        decisions.append("Pixels outside the masks of captured views were not trained on.")
+    views, share, told = unseen_alone(job, Views(cameras, images, captured, masks))
     return views, share, decisions + told
 
 
