@@ -75,16 +75,18 @@ def _table(source: Path) -> torch.Tensor:
 
 def _rows(images: list[Path], count: int, scene: Path, notes: list[str]) -> dict[Path, int]:
     """Which row each image has; images without one are left out and named."""
-    if len(images) == count:
-        return {path: i for i, path in enumerate(images)}
     found: dict[Path, int] = {}
     for names, whence in _row_names(scene, count):
         row_by_stem = {Path(name).stem: i for i, name in enumerate(names)}
         found = {p: row_by_stem[p.stem] for p in images if p.stem in row_by_stem}
+        if len(found) == len(images) == count:
+            return found
         if found:
             notes.append(f"poses_bounds.npy has {count} rows for {len(images)} images: {whence} tells which is whose.")
             break
     else:
+        if len(images) == count:
+            return {path: i for i, path in enumerate(images)}
         by_number = rows_by_number([p.stem for p in images], range(count))
         if by_number is None or len(images) > count:
             raise InputError(

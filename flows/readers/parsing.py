@@ -233,7 +233,8 @@ def implied_size(
         )
     factor = (x * y) ** 0.5
     whole = round(factor) if factor >= 1 else 1 / round(1 / factor)
-    factor = whole if abs(factor / whole - 1) < 0.04 else factor
+    # A centre that was set is exact in both axes; one that was estimated is off by some percent, and sizes are halved.
+    factor = whole if abs(x / y - 1) > 0.005 and abs(factor / whole - 1) < 0.05 else factor
     notes.append(
         f"The principal point ({middle[0]:g}, {middle[1]:g}) is the middle of images {factor:.3g} times as large as the "
         f"files ({size[0, 0]} x {size[0, 1]} pixels): the intrinsics were scaled down by that."

@@ -23,14 +23,15 @@ from flows.sfm.matches import Features, features, matches
 
 # Views looked at: all of a small scene, evenly spaced ones of a larger.
 MOST_VIEWS = 48
-# Coarse features by which pairs are found, and partners of each view that are looked at closely.
-SCOUTS, PARTNERS = 384, 4
+# Coarse features by which pairs are found; partners of each view that are looked at closely: those with most matches,
+# and those with fewest of at least FEWEST.
+SCOUTS, NEAR, FAR, FEWEST = 384, 3, 2, 20
 # A pair says something from so many matches that agree with one another, and that share of all its matches.
 AGREEING, AGREEING_SHARE = 24, 0.35
-# Share of those that the given cameras must explain: below the first they contradict, above the second they fit.
-CONTRADICTS, FITS = 0.4, 0.6
-# Distance from epipolar lines that still counts as fitting, in units of the focal length (and of the image by RANSAC).
-TOLERANCE = 0.006
+# Share of those that the given cameras must explain.
+FITS = 0.72
+# Distances from epipolar lines, in 1/800 of the image's long side: of matches that agree, and of those that cameras fit.
+AGREEMENT, TOLERANCE = 1.5, 2.0
 # Parallax from which a point behind a camera, or a third view's disagreement, is evidence: in radians.
 PARALLAX = 0.02
 # Error in a third view, as a share of the parallax between them, beyond which the three cameras contradict.
@@ -77,36 +78,53 @@ def check_consistency(capture: Capture) -> list[str]:
     return measure_consistency(capture).warnings(capture.names)
 
 
+@dataclass(frozen=True)
+class Evidence:
+    """What the photos say by themselves: features by view, and for pairs of views that show the same the indices (M) of
+    the features in both that some one epipolar geometry explains."""
+
+    found: dict[int, Features]
+    agreed: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
+
+
 def measure_consistency(capture: Capture) -> Consistency:
     """The check itself; needs given cameras."""
     started = time.monotonic()
+    assert capture.cameras is not None
+    known = evidence(capture)
+    return judge(capture.cameras.world_from_camera.double().numpy(), known, time.monotonic() - started)
+
+
+def evidence(capture: Capture) -> Evidence:
+    """Features and agreeing matches of up to MOST_VIEWS views, evenly spaced ones of a larger scene."""
     pycolmap.logging.minloglevel = 3
     views = np.unique(np.linspace(0, len(capture) - 1, min(len(capture), MOST_VIEWS)).round().astype(int)).tolist()
     found = {v: features(capture, v, _pixels(capture, v)) for v in views}
-    return consistency(capture, found, started)
-
-
-def consistency(capture: Capture, found: dict[int, Features], started: float) -> Consistency:
-    """What the cameras say to features that were found before."""
-    assert capture.cameras is not None
-    poses = capture.cameras.world_from_camera.double().numpy()
-    pairs, bad, fitting = [], [], {}
+    agreed = {}
     for a, b in _candidates(found):
         ia, ib = matches(found[a], found[b])
-        agreed = _agreeing(found[a].rays[ia], found[b].rays[ib])
-        if agreed is None:
-            continue
-        ia, ib = ia[agreed], ib[agreed]
-        fits = _explained(_relative(poses[a], poses[b]), found[a].rays[ia], found[b].rays[ib])
-        pairs.append((a, b))
-        if fits.mean() < CONTRADICTS:
+        kept = _agreeing(found[a].rays[ia], found[b].rays[ib], max(found[a].unit, found[b].unit))
+        if kept is not None:
+            agreed[a, b] = ia[kept], ib[kept]
+    return Evidence(found, agreed)
+
+
+def judge(poses: np.ndarray, known: Evidence, seconds: float = 0.0) -> Consistency:
+    """What the evidence says of poses (N, 4, 4) world_from_camera, OpenCV axes."""
+    started = time.monotonic()
+    bad, fitting = [], {}
+    for (a, b), (ia, ib) in known.agreed.items():
+        one, two = known.found[a], known.found[b]
+        fits = _explained(_relative(poses[a], poses[b]), one.rays[ia], two.rays[ib], max(one.unit, two.unit))
+        if fits.mean() < FITS:
             bad.append((a, b))
-        elif fits.mean() > FITS:
+        else:
             fitting[a, b] = (ia[fits], ib[fits])
-    triples, bad_triples = _triples(poses, found, fitting)
+    triples, bad_triples = _triples(poses, known.found, fitting)
+    pairs = list(known.agreed)
     blamed = _blamed([*bad, *bad_triples], [*pairs, *triples])
-    seconds = time.monotonic() - started
-    return Consistency(len(found), pairs, bad, len(triples), bad_triples, blamed, seconds)
+    seconds += time.monotonic() - started
+    return Consistency(len(known.found), pairs, bad, len(triples), bad_triples, blamed, seconds)
 
 
 def _pixels(capture: Capture, view: int) -> np.ndarray:
@@ -116,20 +134,21 @@ def _pixels(capture: Capture, view: int) -> np.ndarray:
 
 
 def _candidates(found: dict[int, Features]) -> list[tuple[int, int]]:
-    """For each view the partners with which most of its coarse features match, as pairs a < b."""
+    """Pairs a < b: for each view the partners with which most of its coarse features match, and the farthest ones, with
+    which just enough do: errors add up on the way to those."""
     counts = {(a, b): len(matches(found[a], found[b], SCOUTS)[0]) for a, b in combinations(found, 2)}
     pairs = set()
     for view in found:
-        mine = sorted((p for p in counts if view in p), key=lambda p: -counts[p])
-        pairs |= set(mine[:PARTNERS])
+        mine = sorted((p for p in counts if view in p and counts[p] >= FEWEST), key=lambda p: -counts[p])
+        pairs |= {*mine[:NEAR], *mine[NEAR:][-FAR:]}
     return sorted(pairs)
 
 
-def _agreeing(a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
+def _agreeing(a: np.ndarray, b: np.ndarray, unit: float) -> np.ndarray | None:
     """Which matched rays (M, 2) some one epipolar geometry explains, None where too few do to say anything."""
     if len(a) < AGREEING:
         return None
-    options = pycolmap.RANSACOptions(max_error=TOLERANCE / 2, random_seed=SEED, max_num_trials=3000, min_num_trials=300)
+    options = pycolmap.RANSACOptions(max_error=AGREEMENT * unit, random_seed=SEED, max_num_trials=3000, min_num_trials=300)
     result = pycolmap.estimate_fundamental_matrix(a, b, options)
     if result is None:
         return None
@@ -142,7 +161,7 @@ def _relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (np.linalg.inv(b) @ a)[:3]
 
 
-def _explained(b_from_a: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _explained(b_from_a: np.ndarray, a: np.ndarray, b: np.ndarray, unit: float) -> np.ndarray:
     """(M) bool: matches (M, 2) whose Sampson distance (Hartley and Zisserman, 11.9) is small and whose point is in
     front of both cameras where the parallax is large enough to tell."""
     rotation, way = b_from_a[:, :3], b_from_a[:, 3]
@@ -154,7 +173,7 @@ def _explained(b_from_a: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray
     lines_a = np.cross(-rotation.T @ direction, hb @ rotation)
     top = np.abs((hb * lines_b).sum(1))
     norm = np.sqrt((lines_b[:, :2] ** 2).sum(1) + (lines_a[:, :2] ** 2).sum(1))
-    near = top < TOLERANCE * np.maximum(norm, 1e-12)
+    near = top < TOLERANCE * unit * np.maximum(norm, 1e-12)
     depth_a, depth_b, parallax = _depths(turned, direction, hb)
     return near & ((parallax < PARALLAX) | ((depth_a > 0) & (depth_b > 0)))
 

@@ -25,10 +25,11 @@ STEPS = 30
 @dataclass(frozen=True)
 class Features:
     """Of one view: rays (F, 2) float64, x = X/Z and y = Y/Z of each feature in its camera; descriptors (F, 128)
-    float32 of length 1, those of coarse features first."""
+    float32 of length 1, those of coarse features first; unit: the length, as a ray, of 1/800 of the long side."""
 
     rays: np.ndarray
     descriptors: Tensor
+    unit: float
 
 
 def features(capture: Capture, view: int, image: np.ndarray) -> Features:
@@ -54,7 +55,8 @@ def features(capture: Capture, view: int, image: np.ndarray) -> Features:
     coarse_first = np.argsort(-points[:, 2], kind="stable")
     coarse_first = coarse_first[kept.numpy()[coarse_first]]
     unit = torch.from_numpy(described[coarse_first].astype(np.float32))
-    return Features(rays.numpy()[coarse_first], torch.nn.functional.normalize(unit, dim=1))
+    length = max(image.shape[:2]) / LONG_SIDE / float(k[0, 0])
+    return Features(rays.numpy()[coarse_first], torch.nn.functional.normalize(unit, dim=1), length)
 
 
 def undistorted(rays: Tensor, distortion: Tensor, fisheye: bool = False) -> tuple[Tensor, Tensor]:
