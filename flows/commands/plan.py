@@ -6,7 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.markup import escape
+
 from flows.commands.run import make_config
+from flows.names import shown
 from flows.pipeline.jobs import Job, capture_digests, expected_steps, make_jobs, pending
 from flows.pipeline.locks import writing
 from flows.pipeline.scene import ensure_store, execute_stage, prepare_run
@@ -34,7 +37,7 @@ def plan_command(
     These stages are too short to need a server. Raises InputError, ConfigError and others.
     """
     config = make_config(given | {"method": "cat3d"}, config_file, settings)
-    with console.status(f"Reading {source}"):
+    with console.status(f"Reading {escape(shown(source))}"):
         capture, jobs = make_jobs(source, out.resolve(), [v.strip() for v in views], config, reader, image_folder)
         digests = capture_digests(capture)
     with writing(jobs[0].store_path, capture.scene_id):
@@ -55,4 +58,4 @@ def show_plan(job: Job, rows: int) -> None:
     plan, train = plan_run(job, store, store.run(job.run))
     names = store.captured.read("name")
     console.print(plan_table(plan, [str(names[v]) for v in train], rows))
-    console.print(f"Picture: {job.pictures / 'plan.png'}")
+    console.print(f"Picture: {job.pictures / 'plan.png'}", markup=False)

@@ -7,6 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.markup import escape
+
+from flows.names import shown
 from flows.pipeline.jobs import Job, capture_digests, expected_steps, make_jobs, pending
 from flows.progress import console
 from schemas.config import RunConfig, load_config, parse_config
@@ -38,15 +41,16 @@ def run_command(
     """Do everything that is not done yet for one scene and its splits. Raises InputError, ConfigError and others."""
     started = time.monotonic()
     config = make_config(given, config_file, settings)
-    with console.status(f"Reading {source}"):
+    with console.status(f"Reading {escape(shown(source))}"):
         capture, jobs = make_jobs(source, out.resolve(), [v.strip() for v in views], config, reader, image_folder)
         digests = capture_digests(capture)
         todo = {job.run: pending(job, expected_steps(job, capture, digests)) for job in jobs}
-    console.print(f"{capture.scene_id}: {len(capture)} views ({capture.dataset})")
+    stored = f", stored as {capture.scene_id}" if capture.title != capture.scene_id else ""
+    console.print(f"{capture.title}: {len(capture)} views ({capture.dataset}{stored})", markup=False)
     for job in jobs:
         steps = todo[job.run]
         if steps:
-            console.print(f"  {job.run}: to do: " + ", ".join(f"{s.stage} ({s.why})" for s in steps))
+            console.print(f"  {job.run}: to do: " + ", ".join(f"{s.stage} ({s.why})" for s in steps), markup=False)
         else:
             console.print(f"  {job.run}: every stage is done already; nothing to do.")
     if any(todo.values()):
@@ -61,7 +65,7 @@ def run_command(
 
     report = write_report(out.resolve(), only_if_changed=not any(todo.values()))
     print_metrics(out.resolve(), capture.scene_id)
-    console.print(f"Report: {report}  ({time.monotonic() - started:.0f} s)")
+    console.print(f"Report: {report}  ({time.monotonic() - started:.0f} s)", markup=False)
     return jobs
 
 

@@ -30,7 +30,9 @@ def video_length(path: Path) -> tuple[float, float]:
     length = re.search(r"Duration: (\d+):(\d+):([\d.]+)", text)
     rate = re.search(r"Video:.*?([\d.]+)(k?) (?:fps|tbr)", text)
     if not length or not rate:
-        raise InputError(f"{path} is not a video that ffmpeg can read; convert it to mp4, or give its frames as photos.")
+        raise InputError(
+            f"{path} is not a video that ffmpeg can read; convert it to mp4, or give its frames as photos."
+        )
     hours, minutes, seconds = (float(g) for g in length.groups())
     return 3600 * hours + 60 * minutes + seconds, float(rate.group(1)) * (1000 if rate.group(2) else 1)
 

@@ -178,7 +178,8 @@ def expected_steps(job: Job, capture: Capture, digests: dict[str, Any] | None = 
 def stage_config(config: RunConfig, stage: str) -> dict[str, Any]:
     """The settings that can change the stage's result, as plain JSON values."""
     document = config.model_dump(mode="json")
-    document["ingest"].pop("frames")  # the digests of a video's frames cover it
+    for name in ("frames", "check_cameras"):  # the digests of a video's frames cover the one; the other only warns
+        document["ingest"].pop(name)
     document["sample"].pop("checkpoint")  # the hash of its weights is an input of the stages that use them
     own = {} if stage in ("encode", "decode") else document[stage]
     if stage in ("plan", "poses", "sample", "reconstruct"):

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
+from rich.markup import escape
 
 from flows.pipeline.jobs import Job, Step, capture_digests, expected_steps, pending
 from flows.pipeline.locks import writing
@@ -60,7 +61,7 @@ def run_jobs(jobs: list[Job]) -> list[dict[str, Any]]:
         for job in jobs:
             prepare_run(job, capture)
             for step in pending(job, expected_steps(job, capture, digests)):
-                console.print(f"[bold]{step.stage}[/bold] {job.scene_id} {job.run} ({step.why})")
+                console.print(f"[bold]{step.stage}[/bold] {job.scene_id} {job.run} ({escape(step.why)})")
                 records.append(run_stage(step.stage, job.model_dump(mode="json"), dataclasses.asdict(step)))
     return records
 
@@ -88,7 +89,7 @@ def execute_stage(job: Job, step: Step) -> StageRecord:
     store.complete(step.stage, record, job.run)
     write_timing(job, record)
     for sentence in outcome.decisions:
-        console.print(f"  [dim]{sentence}[/dim]")
+        console.print(f"  {sentence}", style="dim", markup=False)
     return record
 
 

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from cat3d_core.cameras import Cameras
 from flows.errors import InputError
+from flows.media.files import list_images
 from flows.names import safe_name, shown, shown_names, source_path
 from flows.readers.sources import scene_of
 
@@ -185,19 +186,30 @@ def read_capture(
 
 
 def _detected(path: Path) -> str:
+    """The first reader that recognises a folder or file; photos in subfolders only where those are no scenes."""
     looked_for = []
     for name in READERS:
         module = importlib.import_module(f"flows.readers.{name}")
         if module.detect(path):
+            inner = _scenes_in(path) if name == "photos" and path.is_dir() else []
+            if inner:
+                raise InputError(
+                    f"{path} is no scene itself, but holds {len(inner)}: give the folder of one, such as {inner[0]}."
+                )
             return name
         looked_for.append(f"  {name}: {module.LOOKS_FOR}")
-    inner = [p for p in sorted(path.iterdir()) if p.is_dir() and _recognised(p)] if path.is_dir() else []
-    hint = f"\nIts folder {inner[0].name} is a scene: give {inner[0]}." if inner else ""
-    raise InputError(f"{path} is not a scene that a reader recognises. Looked for:\n" + "\n".join(looked_for) + hint)
+    raise InputError(f"{path} is not a scene that a reader recognises. Looked for:\n" + "\n".join(looked_for))
 
 
-def _recognised(path: Path) -> bool:
-    return any(importlib.import_module(f"flows.readers.{name}").detect(path) for name in READERS)
+def _scenes_in(path: Path) -> list[Path]:
+    """Subfolders with cameras of their own, where the folder itself has no images."""
+    if list_images(path):
+        return []
+    below = [p for p in sorted(path.iterdir()) if p.is_dir() and not p.name.startswith(".")]
+    named = [
+        importlib.import_module(f"flows.readers.{n}") for n in READERS if n not in ("photos", "procedural", "video")
+    ]
+    return [folder for folder in below if any(module.detect(folder) for module in named)]
 
 
 def _others(path: Path, chosen: str) -> list[str]:

@@ -30,7 +30,6 @@ from flows.readers.parsing import (
     unlisted_note,
 )
 
-
 LOOKS_FOR = "gt_cameras.npz, or frame_annotations.jgz in the folder above (CO3D)"
 ANNOTATIONS = "frame_annotations.jgz"
 READ_KEYS = {"sequence_name", "frame_number", "frame_timestamp", "image", "mask", "viewpoint"}

@@ -5,9 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import numpy as np
 import torch
-from torch import Tensor
 
 from flows.errors import InputError
 from flows.readers import splits
@@ -49,7 +47,11 @@ def read(path: Path, image_folder: str | None, view_counts: tuple[int, ...]) -> 
     paths = [file for _, file in found]
     unregistered = left_out(folder.root, paths, root) if folder.root != root else []
     if unregistered:
-        notes.append(unlisted_note(len(unregistered), f"photos of the folder {folder.root.name} have no pose and were", unregistered))
+        notes.append(
+            unlisted_note(
+                len(unregistered), f"photos of the folder {folder.root.name} have no pose and were", unregistered
+            )
+        )
     if folder.root.name != "images" and folder.root != root:
         notes.append(f"Images are those of {folder.root.name}; --images takes another folder.")
     names = [image.name.replace("\\", "/") for image, _ in found]
@@ -122,7 +124,9 @@ def _model_folders(path: Path) -> list[Path]:
     """Folders with a model, those numbered by the mapper in order."""
     for name in MODEL_FOLDERS:
         folder = path / name
-        numbered = [p for p in folder.iterdir() if p.is_dir() and has_model(p)] if folder.is_dir() and name != "." else []
+        numbered = (
+            [p for p in folder.iterdir() if p.is_dir() and has_model(p)] if folder.is_dir() and name != "." else []
+        )
         numbered.sort(key=lambda p: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", p.name)])
         found = [*numbered, *([folder] if has_model(folder) else [])]
         if found:

@@ -133,7 +133,9 @@ class _Bytes:
         (self.count,) = self.take("<Q")
         content = len(self.data) - 8
         if self.count * smallest_record > content:
-            raise InputError(f"{file} is cut short: it announces {self.count} entries in {content} bytes; copy it again.")
+            raise InputError(
+                f"{file} is cut short: it announces {self.count} entries in {content} bytes; copy it again."
+            )
 
     def take(self, form: str) -> tuple:
         size = struct.calcsize(form)

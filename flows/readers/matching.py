@@ -184,12 +184,12 @@ def left_out(folder: Path, used: Iterable[Path], scene: Path) -> list[str]:
     return [str(p.relative_to(folder)) for p in found]
 
 
-def images_below(folder: Path) -> list[Path]:
-    """Images in a folder and its subfolders (hidden ones and links to folders left out), in sorted order."""
+def images_below(folder: Path, depth: int = 4) -> list[Path]:
+    """Images in a folder and so many levels of subfolders (hidden ones and links to folders left out), sorted."""
     out = list(list_images(folder))
     for below in sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")):
-        if not below.is_symlink():
-            out += images_below(below)
+        if depth and not below.is_symlink():
+            out += images_below(below, depth - 1)
     return out
 
 

@@ -171,9 +171,7 @@ def files_size(paths: Sequence[Path], upright: bool = False) -> Tensor:
     return torch.tensor([image_size(p, upright=upright) for p in paths], dtype=torch.int64).reshape(-1, 2)
 
 
-def _turned(
-    calibrated: Tensor, paths: list[Path], names: list[str], source: Path | str, notes: list[str]
-) -> bool:
+def _turned(calibrated: Tensor, paths: list[Path], names: list[str], source: Path | str, notes: list[str]) -> bool:
     """Whether the cameras belong to the upright images, which only photos turned by 90 degrees can tell."""
     turns = [orientation(p) for p in paths]
     tagged = [i for i, turn in enumerate(turns) if turn > 1]
@@ -182,7 +180,9 @@ def _turned(
     stored, upright = [], []
     for i in (i for i in tagged if turns[i] >= 5):
         width, height = image_size(paths[i], upright=False)
-        fits, fits_turned = (_same_aspect(*size, *calibrated[i].tolist()) for size in ((width, height), (height, width)))
+        fits, fits_turned = (
+            _same_aspect(*size, *calibrated[i].tolist()) for size in ((width, height), (height, width))
+        )
         if fits != fits_turned:
             (stored if fits else upright).append(i)
     if stored and upright:

@@ -42,7 +42,8 @@ def scene_of(path: Path, reader: str = "auto") -> tuple[Path, str]:
     if kind == ".json":
         return path, "transforms" if reader == "auto" else reader
     if kind == ".camera":
-        return path.parent, "strecha" if reader == "auto" else reader
+        above = path.parent.name in ("gt_dense_cameras", "cameras")
+        return path.parent.parent if above else path.parent, "strecha" if reader == "auto" else reader
     if name == "frame_annotations.jgz":
         raise InputError(f"{path} describes a category of CO3D; give the folder of one of its sequences.")
     if kind == ".txt" or kind[1:] in VIDEOS or is_image(path):

@@ -169,7 +169,11 @@ def _unlisted(path: Path, listing: Listing) -> list[str]:
     names = [n for n in left_out(folder, [f.path for f in listing.frames], path) if "/" not in n]
     masks = {str(f.entry.get("mask_path", "")).replace("\\", "/").split("/")[-1] for f in listing.frames}
     names = [n for n in names if n not in masks and "depth" not in n and "normal" not in n]
-    return [unlisted_note(len(names), f"photos of the folder {folder.name} that no frame names were", names)] if names else []
+    return (
+        [unlisted_note(len(names), f"photos of the folder {folder.name} that no frame names were", names)]
+        if names
+        else []
+    )
 
 
 def _other_sizes(path: Path, name: str) -> list[tuple[float, float]]:

@@ -28,10 +28,15 @@ MOST_VIEWS = 48
 SCOUTS, NEAR, FAR, FEWEST = 384, 3, 2, 20
 # A pair says something from so many matches that agree with one another, and that share of all its matches.
 AGREEING, AGREEING_SHARE = 24, 0.35
-# Share of those that the given cameras must explain.
-FITS = 0.72
 # Distances from epipolar lines, in 1/800 of the image's long side: of matches that agree, and of those that cameras fit.
 AGREEMENT, TOLERANCE = 1.5, 2.0
+# Cameras contradict a pair if they explain less than this share of its agreeing matches. More than that can't be chance:
+# the others are then of things that repeat.
+EXPLAINED = 0.25
+# They also do if of so many matches the middle one is so far off: estimated cameras that drifted apart.
+MANY, DRIFTED = 48, (1.0, 20.0)
+# Share of a view's pairs that must contradict it, and the least number, before it is named.
+NAMED_SHARE, NAMED_LEAST = 0.3, 2
 # Parallax from which a point behind a camera, or a third view's disagreement, is evidence: in radians.
 PARALLAX = 0.02
 # Error in a third view, as a share of the parallax between them, beyond which the three cameras contradict.
@@ -62,6 +67,13 @@ class Consistency:
                 f"Warning: the given cameras do not fit the photos ({checked} contradict them). Wrong axes, an order of "
                 "cameras that is not that of the photos, photos turned since, or intrinsics of another size would do "
                 "this; --set poses.estimate=always estimates the cameras instead."
+            ]
+        split = _split(self.bad_pairs)
+        if split is not None:
+            return [
+                f"Warning: the cameras from {names[split]} on do not fit those before it ({checked} contradict them, "
+                "nearly all across that view). Take the views on one side of it, correct the cameras, or estimate all "
+                "with --set poses.estimate=always."
             ]
         who = ", ".join(names[v] for v in sorted(self.blamed)[:12]) + (" …" if len(self.blamed) > 12 else "")
         also = f" and {len(self.bad_triples)} of {self.triples} triples" if self.bad_triples else ""
@@ -115,8 +127,11 @@ def judge(poses: np.ndarray, known: Evidence, seconds: float = 0.0) -> Consisten
     bad, fitting = [], {}
     for (a, b), (ia, ib) in known.agreed.items():
         one, two = known.found[a], known.found[b]
-        fits = _explained(_relative(poses[a], poses[b]), one.rays[ia], two.rays[ib], max(one.unit, two.unit))
-        if fits.mean() < FITS:
+        unit = max(one.unit, two.unit)
+        distance, front = _distances(_relative(poses[a], poses[b]), one.rays[ia], two.rays[ib])
+        fits = front & (distance < TOLERANCE * unit)
+        drift = float(np.median(np.where(front, distance, np.inf))) / unit
+        if fits.mean() < EXPLAINED or (len(ia) >= MANY and DRIFTED[0] < drift < DRIFTED[1]):
             bad.append((a, b))
         else:
             fitting[a, b] = (ia[fits], ib[fits])
@@ -148,7 +163,9 @@ def _agreeing(a: np.ndarray, b: np.ndarray, unit: float) -> np.ndarray | None:
     """Which matched rays (M, 2) some one epipolar geometry explains, None where too few do to say anything."""
     if len(a) < AGREEING:
         return None
-    options = pycolmap.RANSACOptions(max_error=AGREEMENT * unit, random_seed=SEED, max_num_trials=3000, min_num_trials=300)
+    options = pycolmap.RANSACOptions(
+        max_error=AGREEMENT * unit, random_seed=SEED, max_num_trials=3000, min_num_trials=300
+    )
     result = pycolmap.estimate_fundamental_matrix(a, b, options)
     if result is None:
         return None
@@ -161,9 +178,9 @@ def _relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (np.linalg.inv(b) @ a)[:3]
 
 
-def _explained(b_from_a: np.ndarray, a: np.ndarray, b: np.ndarray, unit: float) -> np.ndarray:
-    """(M) bool: matches (M, 2) whose Sampson distance (Hartley and Zisserman, 11.9) is small and whose point is in
-    front of both cameras where the parallax is large enough to tell."""
+def _distances(b_from_a: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of matches (M, 2) the Sampson distance (Hartley and Zisserman, 11.9) to their epipolar lines, as a ray; and
+    whether their point is in front of both cameras, as far as the parallax can tell."""
     rotation, way = b_from_a[:, :3], b_from_a[:, 3]
     ha, hb = (np.concatenate([x, np.ones((len(x), 1))], 1) for x in (a, b))
     turned = ha @ rotation.T
@@ -173,9 +190,8 @@ def _explained(b_from_a: np.ndarray, a: np.ndarray, b: np.ndarray, unit: float) 
     lines_a = np.cross(-rotation.T @ direction, hb @ rotation)
     top = np.abs((hb * lines_b).sum(1))
     norm = np.sqrt((lines_b[:, :2] ** 2).sum(1) + (lines_a[:, :2] ** 2).sum(1))
-    near = top < TOLERANCE * unit * np.maximum(norm, 1e-12)
     depth_a, depth_b, parallax = _depths(turned, direction, hb)
-    return near & ((parallax < PARALLAX) | ((depth_a > 0) & (depth_b > 0)))
+    return top / np.maximum(norm, 1e-12), (parallax < PARALLAX) | ((depth_a > 0) & (depth_b > 0))
 
 
 def _depths(turned: np.ndarray, way: np.ndarray, hb: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -228,13 +244,26 @@ def _length_ratio(from_middle: list[np.ndarray], rays: np.ndarray, others: list[
     return float(np.median(depths[0][clear] / depths[1][clear]))
 
 
+def _split(bad: Sequence[tuple[int, int]]) -> int | None:
+    """The view from which on the cameras contradict those before, None where the contradictions are no such thing."""
+    if len(bad) < 6:
+        return None
+    crossing = {s: sum(a < s <= b for a, b in bad) for s in range(1, max(b for _, b in bad) + 1)}
+    most = max(crossing.values())
+    best = [s for s, count in crossing.items() if count == most]
+    across = [(a, b) for a, b in bad if a < best[0] <= b]
+    several = min(len({a for a, _ in across}), len({b for _, b in across})) >= 3
+    return best[len(best) // 2] if most >= 0.9 * len(bad) and several else None
+
+
 def _blamed(bad: Sequence[tuple[int, ...]], checked: Sequence[tuple[int, ...]]) -> list[int]:
-    """Fewest views that take part in all contradictions, found greedily: the one with most of them first."""
+    """Few views that take part in all contradictions, found greedily: the one with most of them first. Those with too
+    few of their own are not named: what repeats in a scene makes single pairs look wrong."""
     open_, out = list(bad), []
-    total = Counter(v for group in checked for v in group)
+    mine, total = (Counter(v for group in groups for v in group) for groups in (bad, checked))
     while open_:
         count = Counter(v for group in open_ for v in group)
-        worst = max(count, key=lambda v: (count[v] / total[v] > 0.5, count[v], count[v] / total[v]))
+        worst = max(count, key=lambda v: (count[v], count[v] / total[v]))
         out.append(worst)
         open_ = [group for group in open_ if worst not in group]
-    return out
+    return [v for v in out if mine[v] >= min(NAMED_LEAST, total[v]) and mine[v] >= NAMED_SHARE * total[v]]

@@ -13,8 +13,9 @@ from cat3d_core.cameras import Cameras
 from flows.errors import InputError
 from flows.media import images
 from flows.pipeline.jobs import Job, Outcome, capture_digests
-from flows.progress import meter
+from flows.progress import console, meter
 from flows.readers.base import Capture
+from flows.sfm.consistency import check_consistency
 from schemas.config import IngestConfig
 from schemas.scene_store import SceneStore
 
@@ -50,6 +51,9 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     decisions = list(capture.notes)
     if capture.distortion is not None:
         decisions.append("The images were undistorted; the stored intrinsics are those of the pinhole images.")
+    if capture.paths and job.config.ingest.check_cameras:
+        with console.status(f"Checking the cameras of {job.scene_id}"):
+            decisions += check_consistency(capture)
     pixels = sum(v.image.shape[0] * v.image.shape[1] for v in views)
     return Outcome({"views": count, "pixels": pixels}, decisions)
 
@@ -94,9 +98,7 @@ def ingest_view(
     if capture.images is not None:
         image, alpha = capture.images[view], None
     else:
-        image, alpha = images.read_image(
-            capture.paths[view], max_pixels=settings.max_pixels, upright=capture.upright
-        )
+        image, alpha = images.read_image(capture.paths[view], max_pixels=settings.max_pixels, upright=capture.upright)
     mask = alpha
     mask_path = capture.masks[view] if capture.masks else None
     if mask_path is not None:

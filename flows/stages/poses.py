@@ -28,7 +28,14 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     if job.config.poses.estimate == "always":
         masks = capture.masks if capture.upright else []  # they belong to the pixels as stored, the estimate does not
         capture = dataclasses.replace(
-            capture, cameras=None, distortion=None, fisheye=None, points=None, depth_bounds=None, upright=True, masks=masks
+            capture,
+            cameras=None,
+            distortion=None,
+            fisheye=None,
+            points=None,
+            depth_bounds=None,
+            upright=True,
+            masks=masks,
         )
     if capture.cameras is not None:
         decisions = ["Skipped pose estimation: the cameras are given."]
