@@ -30,15 +30,13 @@ def video_length(path: Path) -> tuple[float, float]:
     length = re.search(r"Duration: (\d+):(\d+):([\d.]+)", text)
     rate = re.search(r"Video:.*?([\d.]+)(k?) (?:fps|tbr)", text)
     if not length or not rate:
-        raise InputError(
-            f"{path} is not a video that ffmpeg can read; convert it to mp4, or give its frames as photos."
-        )
+        raise InputError(f"{path} is not a video that ffmpeg can read; convert it to mp4, or give frames as photos.")
     hours, minutes, seconds = (float(g) for g in length.groups())
     return 3600 * hours + 60 * minutes + seconds, float(rate.group(1)) * (1000 if rate.group(2) else 1)
 
 
 class VideoFrames(Sequence[np.ndarray]):
-    """`count` frames (H, W, 3) uint8, turned upright by the video's own mark; written to a temporary folder on first use.
+    """`count` frames (H, W, 3) uint8, turned upright by the video's own mark; on disk from the first use on.
 
     Raises InputError when there are fewer frames than asked for, or the video breaks off.
     """

@@ -7,6 +7,8 @@ area, as `Cameras.resize` does, and `undistort` keeps the image size and returns
 from __future__ import annotations
 
 import os
+import re
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from flows.errors import InputError
-from flows.media.files import MAX_PIXELS, first_line, opened
+from flows.media.files import MAX_PIXELS, first_line, opened, plain_folder
 from flows.media.lens import distorted_pixels, filling_zoom
 
 #: sRGB grey around images that are padded to squares: the middle of the range the autoencoder knows.
@@ -117,8 +119,8 @@ def undistort(
 ) -> tuple[np.ndarray, Tensor]:
     """The image a pinhole camera would have taken: same size, and its intrinsics (3, 3) float64.
 
-    image (H, W, C) or (H, W) uint8; intrinsics (3, 3) of this image; distortion and fisheye as in `lens.distort`. Size and
-    principal point stay; one zoom of the focal lengths is chosen as the smallest with no pixel outside the photo, so
+    image (H, W, C) or (H, W) uint8; intrinsics (3, 3) of this image; distortion and fisheye as in `lens.distort`. Size
+    and principal point stay; one zoom of the focal lengths is chosen as the smallest with no pixel outside the photo, so
     there is no black border and nearly the whole view stays. Own inverse warp: cubic sampling (`nearest` for masks).
     Raises InputError where no moderate zoom does it (coefficients that no lens has).
     """
@@ -186,17 +188,18 @@ def _from_planes(planes: Tensor, ndim: int) -> np.ndarray:
 
 def _write(path: Path, pixels: np.ndarray, attributes: dict[str, Any]) -> None:
     pixels = np.ascontiguousarray(pixels if pixels.ndim == 3 else pixels[..., None])
-    partial = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "uint8")
     for name, value in (attributes | {"oiio:UnassociatedAlpha": 1}).items():
         spec[name] = value
-    target = oiio.ImageOutput.create(str(partial))
-    if target is None:
-        raise InputError(f"{path} has no extension of an image format; end it in .png or .jpg.")
-    try:
-        written = target.open(str(partial), spec) and target.write_image(pixels)
-        if not (target.close() and written):
-            raise InputError(f"{path} cannot be written ({first_line(target.geterror())}).")
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with plain_folder(path.parent) as folder:
+        partial = folder / f".cat3d-{os.getpid()}-{threading.get_ident()}{path.suffix}"
+        target = oiio.ImageOutput.create(str(partial)) if re.fullmatch(r"\.[A-Za-z0-9]+", path.suffix) else None
+        if target is None:
+            raise InputError(f"{path} has no extension of an image format; end it in .png or .jpg.")
+        try:
+            written = target.open(str(partial), spec) and target.write_image(pixels)
+            if not (target.close() and written):
+                raise InputError(f"{path} cannot be written ({first_line(target.geterror())}).")
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)

@@ -32,7 +32,7 @@ def read(path: Path, image_folder: str | None, view_counts: tuple[int, ...]) -> 
     folders = _model_folders(path)
     if not folders:
         raise InputError(
-            f"{path} has no COLMAP model; looked for cameras.bin or cameras.txt in sparse/0, {', '.join(MODEL_FOLDERS)}."
+            f"{path} has no COLMAP model; looked for cameras.bin or .txt in sparse/0, {', '.join(MODEL_FOLDERS)}."
         )
     notes: list[str] = []
     model = _largest([load_model(folder) for folder in folders], notes)

@@ -134,7 +134,7 @@ class _Bytes:
         content = len(self.data) - 8
         if self.count * smallest_record > content:
             raise InputError(
-                f"{file} is cut short: it announces {self.count} entries in {content} bytes; copy it again."
+                f"{file} is cut short: it announces {self.count} entries in {content} bytes; copy it anew."
             )
 
     def take(self, form: str) -> tuple:
@@ -215,7 +215,8 @@ def _text_cameras(file: Path) -> dict[int, ModelCamera]:
             params = tuple(float(p) for p in parts[4:])
         except (ValueError, IndexError):
             raise InputError(
-                f"{file} cannot be read (line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, got {line[:60]!r})."
+                f"{file} cannot be read (line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, got "
+                f"{line[:60]!r})."
             ) from None
         if model not in LENGTHS or len(params) != LENGTHS[model]:
             wanted = f"{LENGTHS[model]} parameters, it has {len(params)}" if model in LENGTHS else "a model of COLMAP"

@@ -32,7 +32,7 @@ FISHEYE_ORDER = ("k1", "k2", "k3", "k4")
 
 
 class Lens(NamedTuple):
-    """K (3, 3) in pixels, coefficients (8) as in `media.lens.distort` padded with zeros, and whether it is a fisheye."""
+    """K (3, 3) in pixels, coefficients (8) as in `media.lens.distort` padded with zeros, and whether it is fisheye."""
 
     intrinsics: Tensor
     distortion: Tensor

@@ -91,12 +91,12 @@ def _rows(images: list[Path], count: int, scene: Path, notes: list[str]) -> dict
         if by_number is None or len(images) > count:
             raise InputError(
                 f"{scene / 'poses_bounds.npy'} has {count} rows, but {images[0].parent} has {len(images)} images, and "
-                "nothing tells which row is whose; remove the images without a pose, or put the COLMAP model (sparse/0) "
-                "beside it."
+                "nothing tells which row is whose; remove the images without a pose, or put the COLMAP model "
+                "(sparse/0) beside it."
             )
         found = {path: row for path, row in zip(images, by_number, strict=True) if row is not None}
         notes.append(
-            f"poses_bounds.npy has {count} rows for {len(images)} images: the numbers in their names tell which is whose."
+            f"poses_bounds.npy has {count} rows for {len(images)} images: numbers in the names tell which is whose."
         )
     without = [p.name for p in images if p not in found]
     if without:

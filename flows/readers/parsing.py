@@ -236,8 +236,8 @@ def implied_size(
     # A centre that was set is exact in both axes; one that was estimated is off by some percent, and sizes are halved.
     factor = whole if abs(x / y - 1) > 0.005 and abs(factor / whole - 1) < 0.05 else factor
     notes.append(
-        f"The principal point ({middle[0]:g}, {middle[1]:g}) is the middle of images {factor:.3g} times as large as the "
-        f"files ({size[0, 0]} x {size[0, 1]} pixels): the intrinsics were scaled down by that."
+        f"The principal point ({middle[0]:g}, {middle[1]:g}) is the middle of images {factor:.3g} times as large as "
+        f"the files ({size[0, 0]} x {size[0, 1]} pixels): the intrinsics were scaled down by that."
     )
     return size.double() * factor
 

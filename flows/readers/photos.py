@@ -56,7 +56,7 @@ def _photos(path: Path, notes: list[str]) -> tuple[Path, list[Path]]:
         others = [f"{f.name} ({len(images)})" for f, images in folders.items() if images]
         if others:
             notes.append(
-                f"The photos are those of the folder itself; images in its subfolders were left out: {', '.join(others)}. "
+                f"The photos are those of the folder itself; images in subfolders were left out: {', '.join(others)}. "
                 "--images NAME takes a subfolder instead."
             )
         return path, images_in(path, path)

@@ -28,10 +28,10 @@ MOST_VIEWS = 48
 SCOUTS, NEAR, FAR, FEWEST = 384, 3, 2, 20
 # A pair says something from so many matches that agree with one another, and that share of all its matches.
 AGREEING, AGREEING_SHARE = 24, 0.35
-# Distances from epipolar lines, in 1/800 of the image's long side: of matches that agree, and of those that cameras fit.
+# Distances from epipolar lines, in 1/800 of the image's long side: of matches that agree, and of those that fit.
 AGREEMENT, TOLERANCE = 1.5, 2.0
-# Cameras contradict a pair if they explain less than this share of its agreeing matches. More than that can't be chance:
-# the others are then of things that repeat.
+# Cameras contradict a pair if they explain less than this share of its agreeing matches. More can't be chance: the
+# others are then of things that repeat.
 EXPLAINED = 0.25
 # They also do if of so many matches the middle one is so far off: estimated cameras that drifted apart.
 MANY, DRIFTED = 48, (1.0, 20.0)
@@ -64,8 +64,8 @@ class Consistency:
             return []
         if len(self.bad_pairs) > 0.7 * len(self.pairs):
             return [
-                f"Warning: the given cameras do not fit the photos ({checked} contradict them). Wrong axes, an order of "
-                "cameras that is not that of the photos, photos turned since, or intrinsics of another size would do "
+                f"Warning: the given cameras do not fit the photos ({checked} contradict them). Wrong axes, an order "
+                "of cameras that is not that of the photos, photos turned since, or intrinsics of another size would do "
                 "this; --set poses.estimate=always estimates the cameras instead."
             ]
         split = _split(self.bad_pairs)

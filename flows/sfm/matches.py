@@ -1,4 +1,4 @@
-"""Features of photos and their matches, for checks on given cameras: SIFT at a small size, mutual nearest neighbours."""
+"""Features of photos and their matches, for checks on cameras: SIFT at a small size, mutual nearest neighbours."""
 
 from __future__ import annotations
 

@@ -105,8 +105,8 @@ def ingest_view(
         mask = images.read_mask(mask_path, upright=capture.upright)
         if capture.mask_training and not mask.any():
             raise InputError(
-                f"The mask {mask_path} of {capture.names[view]} is black everywhere, which leaves no pixel to train on; "
-                "mend the mask (white is what counts), or leave the view out."
+                f"The mask {mask_path} of {capture.names[view]} is black everywhere, which leaves no pixel to train "
+                "on; mend the mask (white is what counts), or leave the view out."
             )
         if mask.shape != image.shape[:2]:
             mask = images.resize(mask, image.shape[1], image.shape[0])

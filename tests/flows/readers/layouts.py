@@ -1,4 +1,4 @@
-"""Every layout of the readers, written to disk from known cameras and images: what the table-driven tests go through."""
+"""Every layout of the readers, written to disk from known cameras and images: for table-driven tests."""
 
 from __future__ import annotations
 

@@ -71,9 +71,7 @@ def test_a_folder_round_the_scene_is_refused_with_its_name(tmp_path):
         read_capture(tmp_path / "unzipped")
 
 
-@pytest.mark.parametrize(
-    "name", ["transforms", "reconfusion", "nerf_synthetic", "realestate10k", "strecha", "colmap_text"]
-)
+@pytest.mark.parametrize("name", ["transforms", "nerf_synthetic", "realestate10k", "strecha", "colmap_text"])
 def test_a_byte_order_mark_and_windows_lines(tmp_path, name):
     cameras = small_cameras(64, 48)
     path = LAYOUTS[name](tmp_path, cameras, drawn(cameras), NAMES)

@@ -27,7 +27,7 @@ ODD = {
     "brackets": "photo [1] (2) {3}",
     "markup": "[bold] [red]x",
     "colon": "12:30:05",
-    "dots": "..a.b.c..",
+    "dots": "a..b.c..",
     "backslash": "a\\b",
     "question and hash": "what?#%04d",
     "quotes": 'it\'s "so" `$HOME`',
