@@ -45,11 +45,12 @@ def run(
 ) -> None:
     """Photos in, 3D scene out: renders, metrics and a report. Stages that are done already are not done again."""
     from flows.commands.run import run_command
+    from flows.jobs.request import make_request
 
     given = {"downscale": downscale, "method": method, "preset": preset, "seed": seed}
     if model is not None:
         given["model"] = str(model.resolve())
-    run_command(source, out, views.split(","), given, reader, images, config, set_ or [])
+    run_command(make_request(source, out, views, given, reader, images, config, set_ or []))
 
 
 @app.command()
@@ -82,9 +83,10 @@ def plan(
 ) -> None:
     """Which views would be generated, how they are grouped and on what they are conditioned: a table and a picture."""
     from flows.commands.plan import plan_command
+    from flows.jobs.request import make_request
 
-    given = {"downscale": downscale, "seed": seed, "trajectory": trajectory, "count": count}
-    plan_command(source, out, views.split(","), given, reader, images, config, set_ or [], rows)
+    given = {"method": "cat3d", "downscale": downscale, "seed": seed, "trajectory": trajectory, "count": count}
+    plan_command(make_request(source, out, views, given, reader, images, config, set_ or []), rows)
 
 
 @app.command()
@@ -236,7 +238,9 @@ def bench(
     data: Annotated[Path | None, typer.Option(help="Folder of real scenes, for what needs them.")] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder for benchmarks.md and benchmarks/NAME.parquet; docs in a checkout."),
+        typer.Option(
+            "--out", "-o", help="Folder for benchmarks.md and benchmarks/NAME.parquet; docs/reference in a checkout."
+        ),
     ] = None,
 ) -> None:
     """Run time against error for every stage: tables, fronts, and where the defaults stand on them."""

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor, nn
+from torch import Tensor
 
 from cat3d_core.diffusion.autoencoder import ENCODER
 from cat3d_core.diffusion.config import ModelConfig
@@ -85,7 +85,7 @@ def load_model(
 
 def describe(path: str | Path) -> dict[str, Any]:
     """Configuration, provenance and hashes of a model file, without loading its weights: `sha256` of all of them,
-    `encoder_sha256` of those that make latents (the former in files from before there was the latter)."""
+    `encoder_sha256` of those that make latents (older files do not say it; `sha256` stands for it there)."""
     metadata, _ = _read(Path(path), weights=False)
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path} is no cat3d model: its format is {metadata.get('format')!r}, expected {FORMAT!r}.")
@@ -108,11 +108,6 @@ def load_state(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     if "state" not in metadata:
         raise ValueError(f"{path} is no saved training state.")
     return state, json.loads(metadata["state"])
-
-
-def copy_weights(source: nn.Module, target: nn.Module) -> None:
-    """Copy parameters and buffers between two modules of one architecture, converting dtype and device."""
-    target.load_state_dict(source.state_dict())
 
 
 def _write(path: Path, state: dict[str, Tensor], metadata: dict[str, str]) -> None:

@@ -20,7 +20,7 @@ from prefect import task
 from prefect.cache_policies import NO_CACHE
 from prefect_dask.client import PrefectDaskClient
 
-from flows.workers.local import visible_gpus
+from flows.jobs.device import visible_gpus
 from flows.workers.work import Answer, Batch, run_batch
 from schemas.config import ExecutionConfig
 from schemas.errors import ConfigError
@@ -45,7 +45,7 @@ def dask_batch(document: str, label: str) -> str:
 class DaskExecutor:
     """A cluster of its own, or a running one. Dask itself gives a dead worker's batch to another worker."""
 
-    ahead = 1  # a task's way through Prefect and Dask takes 0.1 s and more, see docs/scaling.md
+    ahead = 1  # a task's way through Prefect and Dask takes 0.1 s and more, see docs/explanation/scaling.md
 
     def __init__(self, settings: ExecutionConfig) -> None:
         self.resources = dict(settings.dask_resources)
