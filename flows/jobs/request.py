@@ -48,9 +48,7 @@ class Request:
                 check_solver(self.config.sample.solver)
             except ValueError as error:
                 raise ConfigError(f"sample.solver: {error}") from None
-        scene = scene or Scene(
-            source_text(self.source), self.reader, self.image_folder, self.config.ingest.frames
-        )
+        scene = scene or Scene(source_text(self.source), self.reader, self.image_folder, self.config.ingest.frames)
         jobs = []
         for split in self.views:
             job = Job(

@@ -123,7 +123,8 @@ class HeifFile:
 
     def spec(self) -> oiio.ImageSpec:
         """Size and channels; EXIF's focal length where it is recorded."""
-        spec = oiio.ImageSpec(*self._file.size, len(self._file.mode), "uint8")
+        width, height = self._file.size
+        spec = oiio.ImageSpec(int(width), int(height), len(self._file.mode), "uint8")
         spec.channelnames = tuple(self._file.mode)
         focal_mm = self._exif_focal_mm()
         if focal_mm:

@@ -42,13 +42,13 @@ class VideoFrames(Sequence[np.ndarray]):
     """
 
     def __init__(self, path: Path, count: int, seconds: float, rate: float) -> None:
-        self.path, self.count = path, count
+        self.path, self.wanted = path, count
         tried = max(1, min(TRIED, int(rate * seconds / count)))
         self._rate = f"{count * tried}/{seconds:.6f}"
         self._files: list[Path] = []
 
     def __len__(self) -> int:
-        return self.count
+        return self.wanted
 
     def __getitem__(self, view: Any) -> Any:
         if not self._files:
@@ -70,9 +70,9 @@ class VideoFrames(Sequence[np.ndarray]):
             reason = done.stderr.decode("utf-8", "replace").strip().splitlines()
             raise InputError(f"{self.path} cannot be decoded ({reason[-1] if reason else 'no reason given'}).")
         files = sorted(Path(folder.name).iterdir())
-        if len(files) != self.count:
+        if len(files) != self.wanted:
             raise InputError(
-                f"{self.path} gave {len(files)} of {self.count} frames: it is shorter or damaged; "
+                f"{self.path} gave {len(files)} of {self.wanted} frames: it is shorter or damaged; "
                 "set ingest.frames to fewer."
             )
         return files
@@ -84,9 +84,9 @@ class VideoFrames(Sequence[np.ndarray]):
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as running:
             assert running.stdout is not None
             scores = [sharpness(image) for image in _pgm_images(running.stdout)]
-        if len(scores) < self.count:
+        if len(scores) < self.wanted:
             raise InputError(f"{self.path} has only {len(scores)} frames; set ingest.frames to fewer than that.")
-        bounds = np.linspace(0, len(scores), self.count + 1).round().astype(int)
+        bounds = np.linspace(0, len(scores), self.wanted + 1).round().astype(int)
         return [int(a + np.argmax(scores[a:b])) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
 
     def _command(self, arguments: list[str]) -> list[str]:

@@ -120,8 +120,8 @@ def undistort(
     """The image a pinhole camera would have taken: same size, and its intrinsics (3, 3) float64.
 
     image (H, W, C) or (H, W) uint8; intrinsics (3, 3) of this image; distortion and fisheye as in `lens.distort`. Size
-    and principal point stay; one zoom of the focal lengths is chosen as the smallest with no pixel outside the photo, so
-    there is no black border and nearly the whole view stays. Own inverse warp: cubic sampling (`nearest` for masks).
+    and principal point stay; one zoom of the focal lengths is chosen as the smallest with no pixel outside the photo,
+    so there is no black border and nearly the whole view stays. Own inverse warp: cubic sampling (`nearest` for masks).
     Raises InputError where no moderate zoom does it (coefficients that no lens has).
     """
     intrinsics = intrinsics.double()

@@ -67,7 +67,8 @@ def _read_npz(path: Path, image_folder: str | None) -> Capture:
     if len(arrays["gtR"]) != count:
         raise InputError(
             f"{source} has {len(arrays['gtR'])} cameras (gtR) for the {count} images of {path / folder}; it says "
-            "nothing of their names, so there must be one for each image, in sorted order. Remove the images without a camera."
+            "nothing of their names, so there must be one for each image, in sorted order. Remove images "
+            "without a camera."
         )
     rotation = numbers(arrays["gtR"], (count, 3, 3), "gtR (one rotation per image)", source)
     translation = numbers(arrays["gtT"], (count, 3), "gtT (one translation per image)", source)

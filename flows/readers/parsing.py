@@ -177,7 +177,8 @@ def _turned(calibrated: Tensor, paths: list[Path], names: list[str], source: Pat
     tagged = [i for i, turn in enumerate(turns) if turn > 1]
     if not tagged:
         return True  # there is nothing to turn
-    stored, upright = [], []
+    stored: list[int] = []
+    upright: list[int] = []
     for i in (i for i in tagged if turns[i] >= 5):
         width, height = image_size(paths[i], upright=False)
         fits, fits_turned = (

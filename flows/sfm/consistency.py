@@ -65,8 +65,8 @@ class Consistency:
         if len(self.bad_pairs) > 0.7 * len(self.pairs):
             return [
                 f"Warning: the given cameras do not fit the photos ({checked} contradict them). Wrong axes, an order "
-                "of cameras that is not that of the photos, photos turned since, or intrinsics of another size would do "
-                "this; --set poses.estimate=always estimates the cameras instead."
+                "of cameras that is not that of the photos, photos turned since, or intrinsics of another size would "
+                "do this; --set poses.estimate=always estimates the cameras instead."
             ]
         split = _split(self.bad_pairs)
         if split is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -88,7 +89,7 @@ def matches(a: Features, b: Features, first: int | None = None) -> tuple[np.ndar
     return kept.nonzero()[:, 0].numpy(), nearest[kept, 0].numpy()
 
 
-def _arrays(keypoints: object, descriptors: object) -> tuple[np.ndarray, np.ndarray]:
+def _arrays(keypoints: Any, descriptors: Any) -> tuple[np.ndarray, np.ndarray]:
     """(F, 3) x, y, scale in pixels, centres at integer + 0.5; (F, 128)."""
     points = np.array([[p.x, p.y, p.compute_scale()] for p in keypoints], np.float32).reshape(-1, 3)
     return points, np.asarray(getattr(descriptors, "data", descriptors)).reshape(len(points), -1)

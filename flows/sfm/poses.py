@@ -117,7 +117,7 @@ def _best_result(attempts: list[Attempt], job: Mapper, names: list[str]) -> Pose
     intrinsics, distortion = [], []
     for i in placed:
         camera = best.cameras[by_index[i].camera_id]
-        lens = lens_of(camera.model.name, camera.params, f"the estimate for {names[i]}")
+        lens = lens_of(camera.model.name, camera.params.tolist(), f"the estimate for {names[i]}")
         lens.intrinsics[:2] /= torch.tensor(job.scales[i], dtype=torch.float64)[:, None]
         intrinsics.append(lens.intrinsics)
         distortion.append(lens.distortion[:5])

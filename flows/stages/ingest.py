@@ -101,9 +101,7 @@ def ingest_view(
     if capture.images is not None:
         image, alpha = capture.images[view], None
     else:
-        image, alpha = images.read_image(
-            capture.paths[view], max_pixels=settings.max_pixels, upright=capture.upright
-        )
+        image, alpha = images.read_image(capture.paths[view], max_pixels=settings.max_pixels, upright=capture.upright)
     mask = alpha
     mask_path = capture.masks[view] if capture.masks else None
     if mask_path is not None:

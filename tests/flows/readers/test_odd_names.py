@@ -9,9 +9,9 @@ import unicodedata
 import numpy as np
 import pytest
 
-from flows.media.images import write_png
 from flows.jobs.job import Job
 from flows.jobs.scene import capture_digests
+from flows.media.images import write_png
 from flows.readers import read_capture
 from flows.stages import ingest
 from schemas.config import RunConfig
