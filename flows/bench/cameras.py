@@ -20,7 +20,7 @@ from flows.sfm.matches import Features
 #: Procedural scenes, where there is no folder of real ones.
 PROCEDURAL = tuple(f"procedural:{family}/3?views=16&width=320&height=240" for family in ("dtu", "llff", "mip360"))
 #: Of the real scenes these have cameras that are wrong as they come (docs/explanation/poses.md).
-KNOWN_WRONG = ("re10k_bedroom",)
+KNOWN_WRONG = ("re10k_bedroom", "mipnerf360_bonsai")
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ from flows.sfm.matches import undistorted
 SCENE = "procedural:dtu/3?views=12&width=320&height=240"
 GROSS = ("poses are in random order", "all poses are inverse", "camera axes are OpenGL's",
          "all photos are turned by 180 degrees", "a quarter of the photos is turned by 180 degrees",
-         "intrinsics are of images twice to eight times as large", "one camera is turned by 2 to 20 degrees")  # fmt: skip
+         "intrinsics are of images twice to eight times as large",
+         "one camera is turned by 2 to 20 degrees")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
