@@ -37,6 +37,10 @@ class IngestConfig(_Model):
     """Divide width and height by this."""
     max_pixels: PositiveInt = 100_000_000
     """Refuse larger source images, in pixels."""
+    frames: Annotated[int, Field(ge=2)] = 60
+    """Frames taken of a video: the sharpest of each of as many equal stretches."""
+    check_cameras: bool = True
+    """Compare given cameras with matches between the photos, and warn of views that they do not fit."""
 
 
 class PosesConfig(_Model):

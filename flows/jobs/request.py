@@ -10,6 +10,7 @@ from typing import Any
 from cat3d_core.diffusion.solvers import check_solver
 from flows.jobs.job import Job
 from flows.jobs.scene import Scene
+from flows.names import source_text
 from schemas.config import RunConfig, load_config, parse_config
 from schemas.errors import ConfigError
 from schemas.settings import merged, set_at, settings_document, value_at
@@ -47,7 +48,7 @@ class Request:
                 check_solver(self.config.sample.solver)
             except ValueError as error:
                 raise ConfigError(f"sample.solver: {error}") from None
-        scene = scene or Scene(self.source, self.reader, self.image_folder)
+        scene = scene or Scene(source_text(self.source), self.reader, self.image_folder, self.config.ingest.frames)
         jobs = []
         for split in self.views:
             job = Job(

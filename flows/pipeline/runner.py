@@ -54,7 +54,7 @@ def execute_stage(job: Job, step: Step) -> StageRecord:
     store.complete(step.stage, record, job.run)
     write_timing(job, record, usage.with_(outcome.usage))
     for decision in outcome.decisions:
-        console.print(f"  [dim]{decision.text}[/dim]")
+        console.print(f"  {decision.text}", style="dim", markup=False)
     return record
 
 
