@@ -18,13 +18,13 @@ import torch
 from cat3d_core.diffusion import GuidanceConfig, SamplerConfig, load_model
 from cat3d_core.diffusion.checkpoint import describe
 from cat3d_core.metrics.perceptual import find_perceptual
-from cat3d_core.nerf import PRESETS
 from cat3d_core.weights import default_model_path
+from cat3d_core.zipnerf import PRESETS
 from flows.bench import metrics, model, plan, poses, reconstruct, sampler, scenes, skips, store, synthetic
-from flows.images import read_image
+from flows.errors import InputError
+from flows.generation.model import GUIDANCE_INTERVAL, SAMPLER_DEFAULT
+from flows.media.images import read_image
 from flows.readers import read_capture
-from flows.readers.base import InputError
-from flows.sampling.model import GUIDANCE_INTERVAL, SAMPLER_DEFAULT
 from schemas.config import PosesConfig, ReconstructConfig, SampleConfig
 
 Row = dict[str, Any]
@@ -95,7 +95,8 @@ def sampler_rows(quick: bool, data: Path | None) -> list[Row]:
     if not quick:
         with contextlib.suppress(MissingError):
             rows += sampler.rows(_model_file(), steps)
-    bounds = tuple(math.copysign(math.inf, i - 0.5) if b is None else b for i, b in enumerate(GUIDANCE_INTERVAL))
+    low, high = GUIDANCE_INTERVAL
+    bounds = (-math.inf if low is None else low, math.inf if high is None else high)
     interval = next(name for name, found in sampler.INTERVALS.items() if found == bounds)
     return _marked(rows, chosen | {"interval": interval, "problem": "mixture"})  # a model's file has its own default
 
