@@ -19,8 +19,8 @@ import torch
 
 from cat3d_core.diffusion import MultiViewModel, describe, load_model, save_model
 from cat3d_core.metrics.perceptual import find_perceptual
-from flows.bench.model import evaluate_file
 from flows.training.autoencoder import reconstruction_psnr, train_autoencoder
+from flows.training.evaluation import evaluate_file
 from flows.training.prepare import read_photos
 from flows.training.renders import rendered_images
 

@@ -85,8 +85,11 @@ class SampleConfig(_Model):
     after few steps without guidance), else the point on the measured front: unipc, log_snr, 10 steps, guidance 3.
     """
 
+    generator: str | None = None
+    """Which generator: "cat3d" or the name of an installed package's (docs/guides/own_generator.md); None: the one that
+    recognises the checkpoint."""
     checkpoint: Path | None = None
-    """Weights of the model; None: the ones shipped."""
+    """File or folder with the generator's weights; None: the ones shipped."""
     solver: str | None = None
     """Solver of the probability-flow ODE (paper: ddim): ddim, dpm++, unipc, or a further one of the core's SOLVERS."""
     nodes: Literal["trailing", "linspace", "log_snr", "karras"] | None = None

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from flows.commands.run import make_config
+from flows.generation.plan import read_plan
 from flows.jobs.job import Job, Request
 from flows.pipeline.runner import opened, run_missing
 from flows.progress import console
 from flows.reporting.plan_drawing import plan_table
-from flows.stages.plan import plan_run
 from schemas.scene_store import SceneStore
 
 
@@ -45,7 +45,6 @@ def plan_command(
 def show_plan(job: Job, rows: int) -> None:
     """Print the plan's groups, its reasons and where its picture is."""
     store = SceneStore.open(job.store_path)
-    plan, train = plan_run(job, store, store.run(job.run))
-    names = store.captured.read("name")
-    console.print(plan_table(plan, [str(names[v]) for v in train], rows))
+    names = [str(name) for name in store.captured.read("name")]
+    console.print(plan_table(read_plan(store.run(job.run).plan, len(names)), names, rows))
     console.print(f"Picture: {job.pictures / 'plan.png'}")

@@ -12,10 +12,10 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.normalization import Similarity
 from cat3d_core.reconstruction import Reconstructor, Render
 from flows.errors import InputError
+from flows.generation.views import generated_views
 from flows.jobs.access import read_cameras, read_images, read_similarity, views_with_role
 from flows.progress import meter
 from flows.reconstruction.stored import read_reconstruction
-from flows.stages.training_views import generated_views
 from schemas.scene_store import Run, SceneStore
 
 FRAMES = ("world", "scene")

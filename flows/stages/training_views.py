@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 
-import numpy as np
 import torch
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.reconstruction import Views
 from flows.generation.brief import LEAST, shown_by_captured
+from flows.generation.views import generated_views
 from flows.jobs.access import read_cameras, read_images, views_with_role
 from flows.jobs.job import Job
 from flows.media.images import resize
@@ -47,15 +46,6 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
     captured = torch.arange(len(cameras)) < len(train)
     views, told = unseen_alone(job, Views.from_images(cameras, images, captured))
     return views, decisions + told
-
-
-def generated_views(run: Run) -> Iterator[tuple[Cameras, torch.Tensor]]:
-    """The generated views that are there: camera and (h, w, 3) uint8 image of the part that isn't padding."""
-    shown = np.flatnonzero(run.generated.read("done_image").any(-1)).tolist()
-    cameras, windows = read_cameras(run.plan, shown), run.plan.read("window", shown).tolist()
-    for i, (view, (x0, y0, width, height)) in enumerate(zip(shown, windows, strict=True)):
-        image = run.generated.read("image", [view])[0, y0 : y0 + height, x0 : x0 + width]
-        yield cameras[i].crop(x0, y0, width, height), torch.from_numpy(np.ascontiguousarray(image))
 
 
 def no_finer(camera: Cameras, image: torch.Tensor, focal: float) -> tuple[Cameras, torch.Tensor]:

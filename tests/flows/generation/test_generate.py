@@ -9,14 +9,17 @@ import pytest
 import torch
 
 from cat3d_core.cameras import Cameras
+from cat3d_core.rays import raymap
 from cat3d_core.sample_sets import source_boxes
 from flows.commands.run import make_config
 from flows.errors import InputError
 from flows.generation.groups import StoredPlan
+from flows.generation.open import open_generator
+from flows.generation.views import generated_views
 from flows.jobs.job import Job, Request
 from flows.media.images import PADDING, read_image, square_image
 from flows.pipeline.keys import pending
-from flows.stages.training_views import generated_views, no_finer
+from flows.stages.training_views import no_finer
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
 from schemas.tables import TIMINGS, read_rows
@@ -131,7 +134,8 @@ def test_raymaps_and_conditions_follow_the_world_frame_of_the_store(model: Path,
     store = SceneStore.open(job.store_path)
     plan = StoredPlan(store, store.run(job.run), 0)
     group = plan.groups[1]
-    maps = plan.raymaps(group, 8)
+    cameras = plan.view_group(group, open_generator(job)).cameras
+    maps = raymap(cameras, cameras.world_from_camera[0], 8, 8).float()
     assert maps.shape == (8, 6, 8, 8)
     assert torch.allclose(maps[0, :3], torch.zeros(3, 8, 8), atol=1e-6)
     centre = maps[0, 3:, 3:5, 3:5].mean((1, 2))
