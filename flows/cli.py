@@ -34,7 +34,9 @@ def run(
     ] = "auto",
     preset: Annotated[str, typer.Option(help="reconstruction preset: tiny, fast, balanced, paper.")] = "fast",
     seed: Annotated[int, typer.Option(help="All randomness follows from it.")] = 0,
-    model: Annotated[Path | None, typer.Option(help="Diffusion model file instead of the shipped one.")] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="A generator's file or folder instead of the shipped model.")
+    ] = None,
     reader: Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")] = "auto",
     images: Annotated[str | None, typer.Option(help="Image folder inside the scene, where there are several.")] = None,
     config: Annotated[Path | None, typer.Option(help="Settings from a YAML or JSON file; options here win.")] = None,
@@ -73,6 +75,7 @@ def plan(
     count: Annotated[int | None, typer.Option(help="Views to generate; without it the recipe's own number.")] = None,
     downscale: Annotated[float, typer.Option(help="Divide image width and height by this.")] = 1,
     seed: Annotated[int, typer.Option(help="All randomness follows from it.")] = 0,
+    model: Annotated[Path | None, typer.Option(help="Plan for this model's file or folder.")] = None,
     reader: Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")] = "auto",
     images: Annotated[str | None, typer.Option(help="Image folder inside the scene, where there are several.")] = None,
     config: Annotated[Path | None, typer.Option(help="Settings from a YAML or JSON file; options here win.")] = None,
@@ -83,6 +86,8 @@ def plan(
     from flows.commands.plan import plan_command
 
     given = {"downscale": downscale, "seed": seed, "trajectory": trajectory, "count": count}
+    if model is not None:
+        given["model"] = str(model.resolve())
     plan_command(source, out, views.split(","), given, reader, images, config, set_ or [], rows)
 
 
@@ -130,7 +135,7 @@ def export(
 
 @app.command()
 def models(
-    describe: Annotated[str | None, typer.Option(help="Describe a size: tiny, small, paper.")] = None,
+    describe: Annotated[str | None, typer.Option(help="Describe a size: tiny, small, paper, seva.")] = None,
     model: Annotated[Path | None, typer.Option(help="Also show this model file.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
 ) -> None:

@@ -89,10 +89,10 @@ def multiview_need(config: ModelConfig, groups: int, dtype: torch.dtype = torch.
     with torch.device("meta"):
         unet, autoencoder = MultiViewUNet(config.unet).to(dtype), Autoencoder(config.autoencoder)
         latents = torch.empty(2 * groups, config.views, channels, size, size, dtype=dtype)
-        rays, mask = torch.empty(*latents.shape[:2], 6, size, size), torch.empty(latents.shape[:2])
+        cameras, mask = torch.empty(*latents.shape[:2], 4, 4), torch.empty(latents.shape[:2])
         images = torch.empty(1, 3, config.image_size, config.image_size)
     work = max(
-        peak_bytes(lambda: unet(latents, torch.empty(2 * groups, device="meta"), rays, mask)),
+        peak_bytes(lambda: unet(latents, torch.empty(2 * groups, device="meta"), cameras, mask)),
         peak_bytes(lambda: autoencoder.decode(autoencoder.encode(images))),
     )
     return Need(weight_bytes([unet, autoencoder]), work)

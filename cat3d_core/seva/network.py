@@ -181,6 +181,19 @@ def resized(rays: Tensor, features: Tensor) -> Tensor:
     return F.interpolate(rays, features.shape[-2:], mode="bilinear", align_corners=True)
 
 
+def count_flops(config: SevaConfig, views: int) -> int:
+    """Floating-point operations (2 per multiply-add) of one evaluation of one window of square views of the trained
+    size, counted without computing it."""
+    from torch.utils.flop_counter import FlopCounterMode
+
+    side = config.image_size // 8
+    with torch.device("meta"), torch.no_grad(), FlopCounterMode(display=False) as counter:
+        latents, rays = torch.empty(1, views, config.latent_channels, side, side), torch.empty(1, views, 6, side, side)
+        context = torch.empty(1, 1, config.context_channels)
+        SevaUNet(config)(latents, torch.empty(1), rays, torch.empty(1, views), context)
+    return int(counter.get_total_flops())
+
+
 def count_parameters(config: SevaConfig) -> int:
     """Parameters of the network, counted without allocating them."""
     with torch.device("meta"):

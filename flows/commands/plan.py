@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from flows.commands.run import make_config
+from flows.generation.open import generator_spec
 from flows.generation.plan import read_plan
 from flows.jobs.job import Job, Request
 from flows.pipeline.runner import opened, run_missing
@@ -34,6 +35,8 @@ def plan_command(
     with console.status(f"Reading {source}"):
         request = Request(source, out.resolve(), tuple(v.strip() for v in views), config, reader, image_folder)
         jobs = request.jobs()
+    if terms := generator_spec(jobs[0]).terms:
+        console.print(terms)
     with opened(jobs[0]):
         for job in jobs:
             run_missing(job, until="plan")

@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from flows.generation.opening import opening
 from flows.jobs.job import Job, Request
-from flows.pipeline.keys import pending
+from flows.pipeline.keys import Step, pending
 from flows.progress import console
 from schemas.config import RunConfig, load_config, parse_config
+from schemas.decisions import Decision
 from schemas.settings import merged, set_at, settings_document, value_at
 
 #: Where each command-line option lives in the configuration.
@@ -45,6 +47,8 @@ def run_command(
         capture = jobs[0].capture()
         todo = {job.run: pending(job) for job in jobs}
     console.print(f"{capture.scene_id}: {len(capture)} views ({capture.dataset})")
+    for sentence in dict.fromkeys(d.text for job in jobs for d in opened(job, todo[job.run])):
+        console.print(sentence)
     for job in jobs:
         steps = todo[job.run]
         if steps:
@@ -65,6 +69,11 @@ def run_command(
     print_metrics(out.resolve(), capture.scene_id)
     console.print(f"Report: {report}  ({time.monotonic() - started:.0f} s)")
     return jobs
+
+
+def opened(job: Job, steps: Sequence[Step]) -> list[Decision]:
+    """What is to be said of the job's generator, where one of the steps that are to be done loads it."""
+    return opening(job) if {"encode", "sample", "decode"} & {step.stage for step in steps} else []
 
 
 def demo_command(out: Path, smallest: bool) -> None:

@@ -26,7 +26,8 @@ def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
     """The training views, what the generator wants (the side of its images in pixels, the views of a group), and what
     may be skipped."""
     spec, skip = generator_spec(job), job.config.skip
-    return {
+    layout = {} if spec.layout == "groups" else {"layout": spec.layout}
+    return layout | {
         "train": job.view_names("train"),
         "image_size": spec.image_size[0],
         "views": spec.views,
@@ -71,6 +72,13 @@ def planned(job: Job, store: SceneStore, train: list[int]) -> Plan:
 def core_config(job: Job, captured: Cameras) -> PlanConfig:
     """The core's settings for the run's; conditioning views and targets together are what the generator takes."""
     settings, spec, skip = job.config.plan, generator_spec(job), job.config.skip
+    if spec.layout == "windows":
+        for name in ("anchors", "condition_views", "group_size"):
+            if getattr(settings, name) is not None:
+                raise ConfigError(
+                    f"plan.{name} is set, but this generator's windows of {spec.views} views follow from "
+                    "the number of photos and of views: leave it out."
+                )
     conditions = settings.condition_views or max((n for n in spec.given if n <= 3), default=min(spec.given))
     if conditions not in spec.given:
         raise ConfigError(
@@ -98,6 +106,7 @@ def core_config(job: Job, captured: Cameras) -> PlanConfig:
         image_size=spec.image_size[0],
         drop_by_coverage=skip.coverage,
         covered_share=COVERED_SHARE if skip.covered_path else None,
+        layout=spec.layout,
     )
 
 

@@ -14,6 +14,7 @@ from cat3d_core.plan import Group
 from flows.errors import WorkerError
 from flows.generation.groups import StoredPlan, view_keys
 from flows.generation.open import generator_spec, open_generator
+from flows.generation.opening import opening
 from flows.generation.rounds import OneRound, Rounds
 from flows.generation.sampling import sampler_config, sampler_settings
 from flows.jobs.job import Job, Outcome
@@ -38,7 +39,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
 
     Views that the scene doesn't need are recorded there as left out on purpose.
     """
-    run = store.run(job.run)
+    run, opened = store.run(job.run), opening(job)
     plan = StoredPlan(store, run, job.config.seed)
     rounds = Rounds(job, store, plan, sampling_flops(job, plan)) if job.config.skip.rounds else OneRound(plan)
     totals, groups, spared = Totals(), [], set(range(len(plan.groups)))
@@ -51,7 +52,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     made = {view for g in rounds.kept for view in plan.groups[g].targets}
     left_out = sorted(set(range(len(plan))) - made)
     run.generated.mark_skipped("done_latent", left_out)
-    decisions = []
+    decisions = opened
     if left_out:
         saved = sum(
             group_cost(job, plan.groups[g], group_sampler(job, plan, plan.groups[g])).evaluations for g in spared

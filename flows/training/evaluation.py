@@ -37,7 +37,7 @@ from cat3d_core.synthetic.held_out import held_out_group
 from cat3d_core.synthetic.tracer import Traced
 from cat3d_core.view_selection import camera_distance
 from flows.errors import InputError
-from flows.jobs.device import device
+from flows.jobs.device import exact_device
 from flows.media.images import read_image, square_image, write_png
 from flows.readers.base import read_capture
 
@@ -197,7 +197,7 @@ def evaluate_file(
 ) -> str:
     """Markdown tables of PSNR, SSIM and (where weights are found) perceptual distance of a model file."""
     perceptual = find_perceptual()
-    model = load_model(path).to(device())
+    model = load_model(path).to(exact_device())
     model.unet = model.unet.to(torch.bfloat16)
     result = rows(
         Cat3dGenerator(model), scenes, sampler=sampler, perceptual=perceptual, pictures=pictures,

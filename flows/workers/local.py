@@ -13,6 +13,7 @@ from typing import BinaryIO, cast
 
 import torch
 
+from flows.jobs.device import cpu_count
 from flows.workers.work import Answer, Batch
 from schemas.config import ExecutionConfig
 
@@ -25,7 +26,7 @@ class LocalExecutor:
 
     def __init__(self, settings: ExecutionConfig, log_folder: Path) -> None:
         self.gpus = visible_gpus()
-        self.count = settings.workers or len(self.gpus) or max(1, len(os.sched_getaffinity(0)) // settings.threads)
+        self.count = worker_count(settings)
         self.threads = settings.threads
         self.log_folder = log_folder
         self.running: dict[int, _Worker] = {}  # by place, 0 to count - 1
@@ -87,6 +88,11 @@ class LocalExecutor:
             with contextlib.suppress(OSError):
                 pipe.close()
         return code
+
+
+def worker_count(settings: ExecutionConfig) -> int:
+    """How many workers this machine gets: as set, else one per GPU, else one per share of the CPU's threads."""
+    return settings.workers or len(visible_gpus()) or max(1, cpu_count() // settings.threads)
 
 
 class _Worker:

@@ -10,11 +10,11 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from cat3d_core.diffusion.pretrained import load_stable_diffusion
-from cat3d_core.metrics.clip import ClipConfig, ClipImageTower
 from cat3d_core.seva.checkpoint import find_seva, load_seva, random_seva, read_config, save_seva
 from cat3d_core.seva.config import TINY
+from cat3d_core.seva.image_prompt import embed
 from cat3d_core.seva.model import load_seva_model
-from tests.core.seva.models import inputs
+from tests.core.seva.models import inputs, write_parts
 
 
 @pytest.fixture(scope="module")
@@ -103,56 +103,21 @@ def test_training_does_not_start_from_seva(file, tmp_path):
             load_stable_diffusion(path)
 
 
-def make_parts(folder, channels=4, scale=0.18215, dimensions=24):
-    """A `vae` folder and a file with an image tower, tiny and random."""
-    from diffusers import AutoencoderKL
-
-    torch.manual_seed(0)
-    AutoencoderKL(
-        block_out_channels=(16, 16, 16, 16),
-        down_block_types=("DownEncoderBlock2D",) * 4,
-        up_block_types=("UpDecoderBlock2D",) * 4,
-        layers_per_block=1,
-        latent_channels=channels,
-        norm_num_groups=8,
-        scaling_factor=scale,
-    ).save_pretrained(folder / "vae")
-    tower = ClipImageTower(ClipConfig(64, 2, 128, 8, 32, dimensions, 1, quick_gelu=False))
-    names = {f"blocks.{i}.": f"visual.transformer.resblocks.{i}." for i in range(2)}
-    parts = {"qkv.": "attn.in_proj_", "out.": "attn.out_proj.", "fc.": "mlp.c_fc.", "proj.": "mlp.c_proj."}
-    state = {}
-    for name, value in tower.state_dict().items():
-        for ours, theirs in names.items():
-            if name.startswith(ours):
-                rest = name.removeprefix(ours)
-                rest = next((new + rest.removeprefix(old) for old, new in parts.items() if rest.startswith(old)), rest)
-                name = theirs + rest
-                break
-        else:
-            name = f"visual.{name}"
-        state[name] = value.contiguous()
-    save_file(state, folder / "tower.safetensors")
-    return folder / "vae", folder / "tower.safetensors", tower
-
-
 def test_model_from_its_three_parts(file, tmp_path):
-    vae, tower_file, tower = make_parts(tmp_path)
+    vae, tower_file, tower = write_parts(tmp_path)
     model = load_seva_model(file, vae, tower_file)
     images = torch.rand(2, 3, 64, 128, generator=torch.Generator().manual_seed(0))
     latents = model.encode(images)
     assert latents.shape == (2, 4, 8, 16)
     assert model.decode(latents).shape == images.shape
-    from cat3d_core.seva.image_prompt import embed
-
     torch.testing.assert_close(model.embed(images), embed(tower, images), rtol=0, atol=1e-5)
 
 
 def test_parts_of_other_models_are_refused(file, tmp_path):
     for folder, changes in (("a", {"channels": 8}), ("b", {"scale": 0.3611})):
-        (tmp_path / folder).mkdir()
-        vae, tower, _ = make_parts(tmp_path / folder, **changes)
+        vae, tower, _ = write_parts(tmp_path / folder, **changes)
         with pytest.raises(ValueError, match="not the autoencoder of Stable Diffusion 2.1"):
             load_seva_model(file, vae, tower)
-    vae, tower, _ = make_parts(tmp_path, dimensions=16)
+    vae, tower, _ = write_parts(tmp_path, dimensions=16)
     with pytest.raises(ValueError, match="not OpenCLIP's ViT-H/14: its embeddings have 16 dimensions"):
         load_seva_model(file, vae, tower)

@@ -35,15 +35,12 @@ class Layout(NamedTuple):
 def lay_out(path: Sequence[int], captured: int, views: int) -> Layout:
     """Windows of at most `views` views for targets whose path numbers are `path`, with so many captured views.
 
-    Raises ValueError where captured views leave no room for a target and the anchors on either side of it.
+    Raises ValueError where a window holds no captured view, a target and the anchors on either side of it.
     """
-    given = min(captured, MOST_GIVEN)
+    if views < 4:
+        raise ValueError(f"Windows hold a captured view, two anchors and what lies between them; {views} are too few.")
+    given = _given(captured, views)
     room = views - given
-    if room < 3:
-        raise ValueError(
-            f"A window of {views} views with {given} captured ones has no room for a view between two anchors: "
-            f"use windows of {given + 3} views or more, or fewer captured views."
-        )
     if len(path) <= views - captured:
         return Layout([Window([], list(range(len(path))))], [], given)
     anchors = anchor_views(path, anchor_count(captured, len(path), views))
@@ -52,9 +49,14 @@ def lay_out(path: Sequence[int], captured: int, views: int) -> Layout:
     return Layout(first, _between(path, anchors, room), given)
 
 
+def _given(captured: int, views: int) -> int:
+    """Captured views in a window of the second pass, which leave room for two anchors and a view between them."""
+    return min(captured, MOST_GIVEN, views - 3)
+
+
 def anchor_count(captured: int, targets: int, views: int) -> int:
     """So many anchors that what lies between two of them fits into a window, and at least as many as fit into one."""
-    between = views - 2 - min(captured, MOST_GIVEN)
+    between = views - 2 - _given(captured, views)
     return min(targets, max(-(-targets // between) + 1, views - captured))
 
 
@@ -62,7 +64,7 @@ def anchor_views(path: Sequence[int], count: int) -> list[int]:
     """About `count` views, evenly spaced along each path from its first to its last view (one alone for a path of one
     view), in order."""
     out = []
-    for start, end in _runs(path):
+    for start, end in runs(path):
         length = end - start
         share = min(length, max(2, round(count * length / len(path))))
         # Half-way places go to the even view, as floating-point rounding has it.
@@ -89,7 +91,7 @@ def _between(path: Sequence[int], anchors: list[int], room: int) -> list[Window]
     return out
 
 
-def _runs(path: Sequence[int]) -> list[tuple[int, int]]:
-    """Half-open ranges of equal path numbers."""
+def runs(path: Sequence[int]) -> list[tuple[int, int]]:
+    """Half-open ranges of equal path numbers: what is made together never spans two paths."""
     edges = [0] + [i for i in range(1, len(path)) if path[i] != path[i - 1]] + [len(path)]
     return [(a, b) for a, b in zip(edges, edges[1:]) if b > a]
