@@ -32,8 +32,12 @@ REFERENCE = SamplerConfig("ddim", "trailing", 50, GuidanceConfig(3.0))
 SECOND_PASS, LEAST = 2.0, 1.2
 
 
-def seva_spec(config: SevaConfig, identity: str = "", encoder_identity: str = "") -> GeneratorSpec:
-    """The spec of a network of SEVA's kind: windows of its trained number of square views of its trained size."""
+def seva_spec(
+    config: SevaConfig, identity: str = "", encoder_identity: str = "", beside: int | None = None
+) -> GeneratorSpec:
+    """The spec of a network of SEVA's kind: windows of its trained number of square views of its trained size.
+
+    beside: bytes of the autoencoder's and the image tower's weights; None: those of the published ones."""
     size = config.image_size
     return GeneratorSpec(
         views=config.views,
@@ -48,7 +52,7 @@ def seva_spec(config: SevaConfig, identity: str = "", encoder_identity: str = ""
         wants=frozenset({"images", "planned"}),
         layout="windows",
         terms=LICENCE,
-        need=partial(_need, config),
+        need=partial(_need, config, beside),
     )
 
 
@@ -63,8 +67,8 @@ def _flops(config: SevaConfig, views: int) -> float:
     return float(count_flops(config, views))
 
 
-def _need(config: SevaConfig, groups: int, dtype: torch.dtype) -> Need:
-    return seva_need(config, groups, dtype=dtype)
+def _need(config: SevaConfig, beside: int | None, groups: int, dtype: torch.dtype) -> Need:
+    return seva_need(config, groups, dtype=dtype, beside=beside)
 
 
 class SevaGenerator:

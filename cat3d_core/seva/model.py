@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from cat3d_core.diffusion.foreign_autoencoders import KLAutoencoder, TinyAutoencoder, load_autoencoder
 from cat3d_core.diffusion.memory import Need, peak_bytes, weight_bytes
@@ -97,9 +97,10 @@ def seva_need(
     views: int | None = None,
     size: int | None = None,
     dtype: torch.dtype = torch.float16,
+    beside: int | None = None,
 ) -> Need:
     """Memory of sampling so many windows of `views` square views of `size` pixels at once with guidance (twice as many
-    in the network), and of encoding and decoding one view."""
+    in the network), and of encoding and decoding one view. beside: bytes of the weights of autoencoder and tower."""
     views, size = views or config.views, size or config.image_size
     side = size // 8
     with torch.device("meta"):
@@ -112,5 +113,5 @@ def seva_need(
         peak_bytes(lambda: network(latents, time, rays, mask, context)),
         peak_bytes(lambda: autoencoder.decode(autoencoder.encode(image))),
     )
-    parts: list[nn.Module] = [network, autoencoder, tower]
-    return Need(weight_bytes(parts), work)
+    others = weight_bytes([autoencoder, tower]) if beside is None else beside
+    return Need(weight_bytes([network]) + others, work)

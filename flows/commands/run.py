@@ -12,7 +12,6 @@ from flows.jobs.job import Job, Request
 from flows.pipeline.keys import Step, pending
 from flows.progress import console
 from schemas.config import RunConfig, load_config, parse_config
-from schemas.decisions import Decision
 from schemas.settings import merged, set_at, settings_document, value_at
 
 #: Where each command-line option lives in the configuration.
@@ -47,7 +46,7 @@ def run_command(
         capture = jobs[0].capture()
         todo = {job.run: pending(job) for job in jobs}
     console.print(f"{capture.scene_id}: {len(capture)} views ({capture.dataset})")
-    for sentence in dict.fromkeys(d.text for job in jobs for d in opened(job, todo[job.run])):
+    for sentence in dict.fromkeys(text for job in jobs for text in opened(job, todo[job.run])):
         console.print(sentence)
     for job in jobs:
         steps = todo[job.run]
@@ -71,7 +70,7 @@ def run_command(
     return jobs
 
 
-def opened(job: Job, steps: Sequence[Step]) -> list[Decision]:
+def opened(job: Job, steps: Sequence[Step]) -> list[str]:
     """What is to be said of the job's generator, where one of the steps that are to be done loads it."""
     return opening(job) if {"encode", "sample", "decode"} & {step.stage for step in steps} else []
 

@@ -6,13 +6,13 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from cat3d_core.cameras import Cameras
 from flows.errors import InputError
 from flows.exports.ply import write_bytes, write_ply
 from flows.media.images import write_png
 from flows.readers.parsing import from_opengl
+from flows.sfm.colmap import pycolmap
 
 
 def write_dataset(

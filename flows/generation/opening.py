@@ -9,16 +9,16 @@ from flows.generation.open import generator_spec
 from flows.jobs.device import available_memory, device
 from flows.jobs.job import Job
 from flows.workers.local import worker_count
-from schemas.decisions import Decision, chosen, warning
 
 #: What allocators and kernels take on top of the tensors that are counted (`cat3d_core.diffusion.memory`).
 ALLOWANCE = 1.25
 
 
-def opening(job: Job) -> list[Decision]:
-    """The generator's terms, and what it needs of memory, where that is much. Raises InputError for too little."""
+def opening(job: Job) -> list[str]:
+    """Sentences on the generator's terms, and on what it needs of memory where that is much. Raises InputError for too
+    little."""
     spec = generator_spec(job)
-    out = [warning(spec.terms)] if spec.terms else []
+    out = [spec.terms] if spec.terms else []
     if spec.need is None:
         return out
     settings = job.config.execution
@@ -33,7 +33,7 @@ def opening(job: Job) -> list[Decision]:
             f"Memory is too small: {of} needs {each}, with allowance {wanted / 2**30:.1f} GiB in all, and "
             f"{there / 2**30:.1f} GiB are free on {device()}. {_remedy(job, processes)}"
         )
-    return [*out, chosen(f"Memory: {of} needs {each}.")]
+    return [*out, f"Memory: {of} needs {each}."]
 
 
 def _remedy(job: Job, processes: int) -> str:

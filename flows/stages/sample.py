@@ -39,7 +39,9 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
 
     Views that the scene doesn't need are recorded there as left out on purpose.
     """
-    run, opened = store.run(job.run), opening(job)
+    opening(job)  # before workers are started in vain
+    run = store.run(job.run)
+    run.generated.set_attrs(terms=generator_spec(job).terms)
     plan = StoredPlan(store, run, job.config.seed)
     rounds = Rounds(job, store, plan, sampling_flops(job, plan)) if job.config.skip.rounds else OneRound(plan)
     totals, groups, spared = Totals(), [], set(range(len(plan.groups)))
@@ -52,7 +54,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     made = {view for g in rounds.kept for view in plan.groups[g].targets}
     left_out = sorted(set(range(len(plan))) - made)
     run.generated.mark_skipped("done_latent", left_out)
-    decisions = opened
+    decisions = []
     if left_out:
         saved = sum(
             group_cost(job, plan.groups[g], group_sampler(job, plan, plan.groups[g])).evaluations for g in spared

@@ -29,7 +29,8 @@ def describe(path: Path | None) -> GeneratorSpec:
     weights, autoencoder, tower = _parts(path)
     encoder = content_key(files=[file_sha256(file) for file in sorted(autoencoder.iterdir()) if file.is_file()])
     identity = content_key(weights=file_sha256(weights), encoder=encoder, tower=file_sha256(tower))
-    return seva_spec(read_config(weights), identity, encoder)
+    beside = sum(file.stat().st_size for file in (*autoencoder.glob("*.safetensors"), tower))
+    return seva_spec(read_config(weights), identity, encoder, beside)
 
 
 def load(path: Path | None, device: str, precision: str) -> Generator:
