@@ -85,7 +85,7 @@ def load_model(
 
 def describe(path: str | Path) -> dict[str, Any]:
     """Configuration, provenance and hashes of a model file, without loading its weights: `sha256` of all of them,
-    `encoder_sha256` of those that make latents (the former in files from before there was the latter)."""
+    `encoder_sha256` of those that make latents (older files do not say it; `sha256` stands for it there)."""
     metadata, _ = _read(Path(path), weights=False)
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path} is no cat3d model: its format is {metadata.get('format')!r}, expected {FORMAT!r}.")

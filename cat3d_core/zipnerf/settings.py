@@ -11,10 +11,15 @@ from cat3d_core.reconstruction.protocol import ReconstructionRequest
 from cat3d_core.reconstruction.views import Views
 from cat3d_core.zipnerf.config import PRESETS, ZipNerfConfig
 
-#: `skip.rays`: steps that see as many rays as there are pixels, at least, and the fewest rays of a step. With generated
-#: views, whose pixels are many and uncertain, a step does with this share of its rays if all steps together still see
-#: as many as twice the pixels: short trainings need them all (150 steps: up to 1.2 dB).
-PASSES, FEWEST_RAYS, GENERATED_SHARE, LEAST_PASSES = 24, 256, 0.75, 2
+#: `skip.rays`: so many steps see as many rays as there are pixels, at least.
+PASSES = 24
+#: `skip.rays`: the fewest rays of a step.
+FEWEST_RAYS = 256
+#: `skip.rays` with generated views, whose pixels are many and uncertain: a step does with this share of its rays.
+GENERATED_SHARE = 0.75
+#: ... if all steps together still see so many times as many rays as there are pixels: short trainings need them all
+#: (150 steps: up to 1.2 dB).
+LEAST_PASSES = 2
 #: `skip.plateau` with more captured views than this: their pixels tell how well other views are met, so training goes
 #: on for as long as they improve at all. (With few views they only tell how well those are remembered.)
 FEW_VIEWS = 9

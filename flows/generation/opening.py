@@ -6,9 +6,8 @@ import torch
 
 from flows.errors import InputError
 from flows.generation.open import generator_spec
-from flows.jobs.device import available_memory, device
+from flows.jobs.device import available_memory, device, worker_count
 from flows.jobs.job import Job
-from flows.workers.local import worker_count
 
 #: What allocators and kernels take on top of the tensors that are counted (`cat3d_core.diffusion.memory`).
 ALLOWANCE = 1.25

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import torch
 
 from flows.errors import InputError
+from schemas.config import ExecutionConfig
 
 
 def device() -> str:
@@ -46,6 +47,18 @@ def available_memory() -> int | None:
     with contextlib.suppress(AttributeError, OSError, ValueError):
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
     return None
+
+
+def visible_gpus() -> list[str]:
+    """The GPUs this process may use, as CUDA_VISIBLE_DEVICES names them."""
+    given = os.environ.get("CUDA_VISIBLE_DEVICES")
+    count = torch.cuda.device_count()
+    return given.split(",")[:count] if given else [str(i) for i in range(count)]
+
+
+def worker_count(settings: ExecutionConfig) -> int:
+    """How many workers this machine gets: as set, else one per GPU, else one per share of the CPU's threads."""
+    return settings.workers or len(visible_gpus()) or max(1, cpu_count() // settings.threads)
 
 
 def free_device_memory() -> None:

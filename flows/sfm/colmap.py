@@ -19,7 +19,7 @@ class _Missing:
         if name.startswith("__"):
             raise AttributeError(name)
         raise InputError(
-            "This needs pycolmap, which is not installed (it has no wheels for Linux on ARM): build it from its source, "
+            "This needs pycolmap, which is not installed (it has no wheels for Linux on ARM): build it from source, "
             "or give a scene with cameras, such as a transforms.json."
         )
 
@@ -29,7 +29,7 @@ _before = signal.getsignal(signal.SIGTERM)
 try:
     import pycolmap
 except ImportError:
-    pycolmap = _Missing()
+    pycolmap = _Missing()  # type: ignore[assignment]
 
 with contextlib.suppress(ValueError, TypeError):  # ValueError: not in the main thread, which handles signals
     signal.signal(signal.SIGTERM, _before)

@@ -42,7 +42,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     train = views_with_role(store, run, "train")
     plan = planned(job, store, train)
     write_plan(run.plan, plan.among(train, store.captured.shape("size")[0]))
-    from flows.reporting.plan_drawing import (
+    from flows.media.plan_drawing import (
         draw_plan,  # matplotlib: a second, which asking what is to do should not cost
     )
 

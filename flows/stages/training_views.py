@@ -44,8 +44,8 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
             text = "Trained on captured views alone, without the LPIPS loss: no view was generated."
             decisions.append(skipped(text, "covered_path"))
     captured = torch.arange(len(cameras)) < len(train)
-    views, told = unseen_alone(job, Views.from_images(cameras, images, captured))
-    return views, decisions + told
+    views, more = unseen_alone(job, Views.from_images(cameras, images, captured))
+    return views, decisions + more
 
 
 def no_finer(camera: Cameras, image: torch.Tensor, focal: float) -> tuple[Cameras, torch.Tensor]:
@@ -65,9 +65,9 @@ def unseen_alone(job: Job, views: Views) -> tuple[Views, list[Decision]]:
     started = time.monotonic()
     shown = shown_by_captured(job, views)
     share = float(shown.sum() / views.size[~views.captured].prod(-1).sum())
-    told = (
+    text = (
         f"{share:.0%} of the pixels of generated views were not trained on, since {LEAST} captured views show their "
         f"places as well: so says a field of those alone ({time.monotonic() - started:.0f} s). At least as large a "
         "share of the rays is theirs."
     )
-    return views.only(~shown), [skipped(told, "seen", pixels=int(shown.sum()))]
+    return views.only(~shown), [skipped(text, "seen", pixels=int(shown.sum()))]

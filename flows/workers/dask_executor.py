@@ -20,7 +20,7 @@ from prefect import task
 from prefect.cache_policies import NO_CACHE
 from prefect_dask.client import PrefectDaskClient
 
-from flows.workers.local import worker_count
+from flows.jobs.device import worker_count
 from flows.workers.work import Answer, Batch, run_batch
 from schemas.config import ExecutionConfig
 from schemas.errors import ConfigError

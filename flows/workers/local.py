@@ -11,9 +11,7 @@ import sys
 from pathlib import Path
 from typing import BinaryIO, cast
 
-import torch
-
-from flows.jobs.device import cpu_count
+from flows.jobs.device import visible_gpus, worker_count
 from flows.workers.work import Answer, Batch
 from schemas.config import ExecutionConfig
 
@@ -90,11 +88,6 @@ class LocalExecutor:
         return code
 
 
-def worker_count(settings: ExecutionConfig) -> int:
-    """How many workers this machine gets: as set, else one per GPU, else one per share of the CPU's threads."""
-    return settings.workers or len(visible_gpus()) or max(1, cpu_count() // settings.threads)
-
-
 class _Worker:
     """A process that runs `flows.workers.worker`; `batch` is the number of the batch it has."""
 
@@ -109,13 +102,6 @@ class _Worker:
                 process_group=0,  # Ctrl-C is for this process, which then ends its workers
             )  # fmt: skip
         self.stdin, self.stdout = cast(BinaryIO, self.process.stdin), cast(BinaryIO, self.process.stdout)
-
-
-def visible_gpus() -> list[str]:
-    """The GPUs this process may use, as CUDA_VISIBLE_DEVICES names them."""
-    given = os.environ.get("CUDA_VISIBLE_DEVICES")
-    count = torch.cuda.device_count()
-    return given.split(",")[:count] if given else [str(i) for i in range(count)]
 
 
 def _how(code: int) -> str:

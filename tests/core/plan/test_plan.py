@@ -129,7 +129,7 @@ def test_the_last_group_may_be_short_and_conditions_can_be_any_number() -> None:
     check(wide)
     assert set(wide.condition[0].tolist()) == {0, 1}
     none = make_plan(arc(2), PlanConfig(count=20, image_size=32, repeat_conditions=False))
-    assert (none.condition[:, 2] == -1).all()
+    assert all(set(group.conditions) == {0, 1} and len(group.conditions) == 2 for group in none.groups)
 
 
 def test_two_captured_views_condition_every_group_nearest_first() -> None:
@@ -219,7 +219,8 @@ def test_groups_are_as_large_as_the_generator_takes(views: int) -> None:
     check(plan)
     given = min(3, views - 1)
     assert {len(group.conditions) for group in plan.groups} == {given}
-    assert set(sizes(plan)[:-1]) == {views - given}
+    assert max(sizes(plan)) == views - given
+    assert sum(size < views - given for size in sizes(plan)) <= len(plan.path.unique()), "the last of a path"
     alone = make_plan(single(), PlanConfig(count=40, image_size=32, views=views))
     check(alone)
     anchors = [group for group in alone.groups if group.anchors]

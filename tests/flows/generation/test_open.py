@@ -11,11 +11,11 @@ import torch
 from cat3d_core.diffusion import SIZES, MultiViewModel, save_model
 from cat3d_core.generation import Cat3dGenerator
 from cat3d_core.generation import cat3d as core
-from flows.commands.run import make_config
 from flows.errors import InputError
 from flows.generation import open as opening
 from flows.generation.open import forget_generator, format_names, generator_spec, open_generator
-from flows.jobs.job import Job, Request
+from flows.jobs.job import Job
+from flows.jobs.request import Request, make_config
 from tests.flows.packages import code_of, install, install_guide
 from tests.flows.workers.scene import SOURCE, random_model, run_of, run_stages
 

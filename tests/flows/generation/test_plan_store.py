@@ -12,7 +12,7 @@ import torch
 
 from cat3d_core.plan import Plan, PlanConfig, make_plan
 from flows.generation.plan import read_plan, write_plan
-from flows.reporting.plan_drawing import draw_plan, plan_table
+from flows.media.plan_drawing import draw_plan, plan_table
 from schemas.scene_store import SceneStore, Section
 from tests.core.plan.layouts import forward_facing, ring, single
 

@@ -16,11 +16,13 @@ import pytest
 from cat3d_core.seva.checkpoint import LICENCE
 from cat3d_core.seva.config import TINY as SHAPE
 from flows.commands.models import model_report
+from flows.commands.run import run_command
 from flows.errors import InputError
 from flows.generation.formats import seva
 from flows.generation.open import recognised
 from flows.generation.plan import read_plan
 from flows.jobs import device
+from flows.jobs.request import make_request
 from schemas.scene_store import Run, SceneStore
 from tests.core.seva.models import write_seva
 from tests.flows.conftest import ROOT, SCENE, TINY, command, environment
@@ -124,13 +126,11 @@ def test_another_network_is_another_identity(model: Path, tmp_path: Path) -> Non
     assert ours.encoder_identity == theirs.encoder_identity
 
 
-def test_too_little_memory_is_a_sentence(cat3d, model: Path, tmp_path: Path, monkeypatch) -> None:
-    from flows.commands.run import run_command
-
+def test_too_little_memory_is_a_sentence(model: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("flows.generation.opening.available_memory", lambda: 2**20)
-    given = {"method": "cat3d", "model": str(model)}
+    given, settings = {"method": "cat3d", "model": str(model)}, ["execution={workers: 2, groups_at_once: 4}"]
     with pytest.raises(InputError, match=r"Memory is too small: each of 2 workers needs .* What helps: execution") as e:
-        run_command(SCENE, tmp_path, ["3"], given, settings=["execution={workers: 2, groups_at_once: 4}"])
+        run_command(make_request(SCENE, tmp_path, "3", given, settings=settings))
     assert "sample.precision=bfloat16" in str(e.value)
 
 

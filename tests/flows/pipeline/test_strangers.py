@@ -36,7 +36,7 @@ def test_a_sweep_over_a_strangers_generator_and_reconstructor(tmp_path: Path, mo
     out = tmp_path / "out"
     assert run_sweep(config, out) == []
     (store,) = (SceneStore.open(path) for path in out.glob("*.zarr"))
-    record = store.record("sample", "v3-toys")
+    record = store.record("decode", "v3-toys")  # sampled ahead, for all scenes of the sweep at once
     assert record is not None
     assert (record.work["views"], record.work["workers"]) == (6, 2)
     run = store.run("v3-toys")
