@@ -76,6 +76,8 @@ class PlanConfig(_Model):
     """Anchor views sampled first; None: 7 with a single photo, else none."""
     always_captured: bool = False
     """Captured views take conditioning slots before anchors do."""
+    image_size: PositiveInt | None = None
+    """Side of the planned views in pixels; None: the generator's. Another is for views that another program makes."""
     wide: bool = False
     """Add the wide samples from padded squares for photos that aren't square."""
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from flows.generation.imported import samples
 from flows.generation.opening import opening
 from flows.jobs.job import Job
 from flows.jobs.request import Request, make_request
@@ -50,7 +51,8 @@ def run_command(request: Request) -> list[Job]:
 
 def to_say(job: Job, steps: Sequence[Step]) -> list[str]:
     """What is to be said of the job's generator, where one of the steps that are to be done loads it."""
-    return opening(job) if {"encode", "sample", "decode"} & {step.stage for step in steps} else []
+    loads = samples(job) and {"encode", "sample", "decode"} & {step.stage for step in steps}
+    return opening(job) if loads else []
 
 
 def demo_command(out: Path, smallest: bool) -> None:

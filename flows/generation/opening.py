@@ -17,6 +17,12 @@ def opening(job: Job) -> list[str]:
     """Sentences on the generator's terms, and on what it needs of memory where that is much. Raises InputError for too
     little."""
     spec = generator_spec(job)
+    asked, own = job.config.plan.image_size, spec.image_size[0]
+    if asked not in (None, own):
+        raise InputError(
+            f"plan.image_size is {asked}, but the generator makes views of {own} x {own} pixels: leave it out, or make "
+            "the planned views with another program (`cat3d export --what plan`, then `cat3d import-views`)."
+        )
     out = [spec.terms] if spec.terms else []
     if spec.need is None:
         return out

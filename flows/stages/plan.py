@@ -29,7 +29,7 @@ def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
     layout = {} if spec.layout == "groups" else {"layout": spec.layout}
     return layout | {
         "train": job.view_names("train"),
-        "image_size": spec.image_size[0],
+        "image_size": planned_size(job),
         "views": spec.views,
         "drop_by_coverage": skip.coverage,
         "covered_share": COVERED_SHARE if skip.covered_path else None,
@@ -69,6 +69,11 @@ def planned(job: Job, store: SceneStore, train: list[int]) -> Plan:
         raise ConfigError(f"The settings of the plan don't work for {job.scene_id}: {error}") from None
 
 
+def planned_size(job: Job) -> int:
+    """Side of the planned views in pixels: the generator's, unless another was asked for."""
+    return job.config.plan.image_size or generator_spec(job).image_size[0]
+
+
 def core_config(job: Job, captured: Cameras) -> PlanConfig:
     """The core's settings for the run's; conditioning views and targets together are what the generator takes."""
     settings, spec, skip = job.config.plan, generator_spec(job), job.config.skip
@@ -103,7 +108,7 @@ def core_config(job: Job, captured: Cameras) -> PlanConfig:
         group_size=settings.group_size,
         keep_captured=settings.always_captured,
         samples="both" if settings.wide and not_square else "square",
-        image_size=spec.image_size[0],
+        image_size=planned_size(job),
         drop_by_coverage=skip.coverage,
         covered_share=COVERED_SHARE if skip.covered_path else None,
         layout=spec.layout,
@@ -115,5 +120,11 @@ def _points(store: SceneStore) -> torch.Tensor | None:
 
 
 STAGE = Stage(
-    "plan", execute, version=1, reads=("poses",), settings=settings_of("plan", "seed"), inputs=inputs, wanted=generates
+    "plan",
+    execute,
+    version=1,
+    reads=("poses",),
+    settings=settings_of("plan", "seed", without=("image_size",)),
+    inputs=inputs,
+    wanted=generates,
 )

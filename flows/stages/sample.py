@@ -13,12 +13,13 @@ from cat3d_core.generation import Cost, MemoryTooSmall
 from cat3d_core.plan import Group
 from flows.errors import WorkerError
 from flows.generation.groups import StoredPlan, view_keys
+from flows.generation.imported import samples
 from flows.generation.open import generator_spec, open_generator
 from flows.generation.opening import opening
 from flows.generation.rounds import OneRound, Rounds
 from flows.generation.sampling import sampler_config, sampler_settings
 from flows.jobs.job import Job, Outcome
-from flows.jobs.stage import Stage, generates, settings_of
+from flows.jobs.stage import Stage, settings_of
 from flows.workers.fan_out import Totals, fan_out
 from flows.workers.work import Work, is_done
 from schemas.decisions import Decision, chosen, skipped
@@ -154,5 +155,5 @@ STAGE = Stage(
     reads=("plan", "encode"),
     settings=settings_of("sample", "seed", without=("generator", "checkpoint")),  # its identity is among the inputs
     inputs=inputs,
-    wanted=generates,
+    wanted=samples,
 )
