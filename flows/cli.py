@@ -24,8 +24,15 @@ OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for stores,
 def run(
     source: Annotated[
         str, typer.Argument(help="A scene's folder (any supported layout, or just photos), or procedural:FAMILY/SEED.")
-    ],
+    ] = "",
     out: OutOption = Path("outputs"),
+    prompt: Annotated[str, typer.Option(help="Text instead of a folder: what the scene's one photo shows.")] = "",
+    text_to_image: Annotated[
+        Path | None, typer.Option(help="For --prompt: folder of a diffusers text-to-image pipeline.")
+    ] = None,
+    text_steps: Annotated[int | None, typer.Option(help="Its steps; without it the pipeline's own number.")] = None,
+    text_guidance: Annotated[float | None, typer.Option(help="Its guidance, likewise.")] = None,
+    text_size: Annotated[int | None, typer.Option(help="Side of its picture in pixels, likewise.")] = None,
     views: Annotated[
         str, typer.Option(help="Training views: counts with a split of the data set, or all; several by commas.")
     ] = "all",
@@ -35,7 +42,9 @@ def run(
     ] = "auto",
     preset: Annotated[str, typer.Option(help="reconstruction preset: tiny, fast, balanced, paper.")] = "fast",
     seed: Annotated[int, typer.Option(help="All randomness follows from it.")] = 0,
-    model: Annotated[Path | None, typer.Option(help="Diffusion model file instead of the shipped one.")] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="A generator's file or folder instead of the shipped model.")
+    ] = None,
     reader: Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")] = "auto",
     images: Annotated[str | None, typer.Option(help="Image folder inside the scene, where there are several.")] = None,
     config: Annotated[Path | None, typer.Option(help="Settings from a YAML or JSON file; options here win.")] = None,
@@ -50,6 +59,13 @@ def run(
     given = {"downscale": downscale, "method": method, "preset": preset, "seed": seed}
     if model is not None:
         given["model"] = str(model.resolve())
+    if bool(prompt) == bool(source) or bool(prompt) != (text_to_image is not None):
+        raise typer.BadParameter("Give the scene's folder, or --prompt and --text-to-image.")
+    if text_to_image is not None:
+        from flows.generation.text import Prompt, text_to_photo
+
+        asked = Prompt(prompt, text_to_image, seed, text_steps, text_guidance, text_size)
+        source = str(text_to_photo(asked, out.resolve()))
     run_command(make_request(source, out, views, given, reader, images, config, set_ or []))
 
 
@@ -75,6 +91,7 @@ def plan(
     count: Annotated[int | None, typer.Option(help="Views to generate; without it the recipe's own number.")] = None,
     downscale: Annotated[float, typer.Option(help="Divide image width and height by this.")] = 1,
     seed: Annotated[int, typer.Option(help="All randomness follows from it.")] = 0,
+    model: Annotated[Path | None, typer.Option(help="Plan for this model's file or folder.")] = None,
     reader: Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")] = "auto",
     images: Annotated[str | None, typer.Option(help="Image folder inside the scene, where there are several.")] = None,
     config: Annotated[Path | None, typer.Option(help="Settings from a YAML or JSON file; options here win.")] = None,
@@ -86,6 +103,8 @@ def plan(
     from flows.jobs.request import make_request
 
     given = {"method": "cat3d", "downscale": downscale, "seed": seed, "trajectory": trajectory, "count": count}
+    if model is not None:
+        given["model"] = str(model.resolve())
     plan_command(make_request(source, out, views, given, reader, images, config, set_ or []), rows)
 
 
@@ -108,7 +127,7 @@ def export(
     store: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder) with a finished run.")],
     run_name: Annotated[str | None, typer.Option("--run", help="The run, where the store has several.")] = None,
     what: Annotated[
-        str, typer.Option(help="mesh, points, dataset, renders; several by commas. All but renders if not given.")
+        str, typer.Option(help="mesh, points, dataset, renders, plan; several by commas. The first three if not given.")
     ] = "",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the exports.")] = Path("exports"),
     frame: Annotated[
@@ -133,9 +152,26 @@ def export(
     export_command(store, run_name, what, out, frame, settings, path)
 
 
+@app.command(name="import-views")
+def import_views(
+    store: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder) with a plan.")],
+    folder: Annotated[Path | None, typer.Argument(help="Folder with view_0000.png and so on.")] = None,
+    run_name: Annotated[str | None, typer.Option("--run", help="The run, where several have a plan.")] = None,
+    note: Annotated[str, typer.Option(help="What made the pictures, such as a model's name; it is recorded.")] = "",
+    partial: Annotated[bool, typer.Option("--partial", help="Some planned views may be missing.")] = False,
+    forget: Annotated[bool, typer.Option("--forget", help="Generate the views here again instead.")] = False,
+) -> None:
+    """Pictures of a plan's views that any other program made (see export --what plan) become the run's."""
+    from flows.commands.import_views import import_views_command
+
+    if forget == (folder is not None):
+        raise typer.BadParameter("Give a folder of pictures, or --forget.")
+    import_views_command(store, folder, run_name, note, partial)
+
+
 @app.command()
 def models(
-    describe: Annotated[str | None, typer.Option(help="Describe a size: tiny, small, paper.")] = None,
+    describe: Annotated[str | None, typer.Option(help="Describe a size: tiny, small, paper, seva.")] = None,
     model: Annotated[Path | None, typer.Option(help="Also show this model file.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from rich.markup import escape
 
+from flows.generation.open import generator_spec
 from flows.generation.plan import read_plan
 from flows.jobs.job import Job
 from flows.jobs.request import Request
@@ -21,6 +22,8 @@ def plan_command(request: Request, rows: int = 24) -> list[Job]:
     """
     with console.status(f"Reading {escape(shown(request.source))}"):
         jobs = request.jobs()
+    if terms := generator_spec(jobs[0]).terms:
+        console.print(terms)
     with opened(jobs[0]):
         for job in jobs:
             run_missing(job, until="plan")

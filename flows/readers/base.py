@@ -13,6 +13,7 @@ import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -61,6 +62,7 @@ class Capture:
     depth_bounds (N, 2): near and far z-depth in world units. dataset: the family, which chooses
     splits and trajectories. depths (N arrays (H, W) float32): true z-depth, inf for the sky, in procedural scenes.
     splits: {"3": {"train": [indices], "test": [indices]}, ..., "all": {...}}; indices into names.
+    made_from: where a text made the photo, the settings of that (`flows/generation/text.py`).
     missing: frames that the data set lists and the folder lacks. notes: sentences about what was assumed or changed.
     """
 
@@ -80,6 +82,7 @@ class Capture:
     depth_bounds: Tensor | None = None
     depths: Sequence[np.ndarray] | None = None
     splits: dict[str, dict[str, list[int]]] = field(default_factory=dict)
+    made_from: dict[str, Any] | None = None
     missing: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     title: str = ""

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from flows.errors import InputError
 from flows.media.files import RAW, VIDEOS, image_size, is_image, list_images
 from flows.readers import splits
 from flows.readers.base import Capture
 from flows.readers.matching import check_link, images_below
-from flows.readers.parsing import images_in, unlisted_note
+from flows.readers.parsing import images_in, load_json, unlisted_note
 
+#: Beside a photo that a text made: `flows/generation/text.py` writes it.
+PROMPT_SETTINGS = "prompt.json"
 LOOKS_FOR = "a folder with image files (or folders of them), or one image file"
 # Folders whose images are no photos of the scene.
 NOT_PHOTOS = ("mask", "depth", "normal", "thumb", "seg", "semantic", "label")
@@ -38,6 +41,10 @@ def read(path: Path, image_folder: str | None, view_counts: tuple[int, ...]) -> 
     for file in paths:
         image_size(file)
     few = "Too few photos to hold any out: all are training views."
+    made_from = _made_from(path)
+    if made_from is not None:
+        how = f"the pipeline {made_from['pipeline_class']} (sha256 {made_from['pipeline_sha256'][:16]})"
+        notes.append(f"The photo was made from the text “{made_from['text']}” by {how}, seed {made_from['seed']}.")
     return Capture(
         scene_id=path.resolve().stem if path.is_file() else path.resolve().name,
         dataset="photos",
@@ -45,6 +52,7 @@ def read(path: Path, image_folder: str | None, view_counts: tuple[int, ...]) -> 
         paths=paths,
         splits=splits.every_8th(len(paths), view_counts),
         notes=[*notes, splits.EVERY_8TH if len(paths) >= 4 else few],
+        made_from=made_from,
     )
 
 
@@ -105,3 +113,17 @@ def _left_out(root: Path, paths: list[Path]) -> list[str]:
     kinds = VIDEOS | RAW | {"svg", "pdf", "psb", "xcf", "ai", "eps", "insp", "insv", "360"}
     unread = [p.name for p in beside if p.suffix[1:].lower() in kinds]
     return [unlisted_note(len(unread), "files that are no photos were", unread)] if unread else []
+
+
+def _made_from(path: Path) -> dict[str, Any] | None:
+    """Settings of the text that made the photo of a folder; None for photographs. Raises InputError for a damaged
+    record."""
+    file = path / PROMPT_SETTINGS
+    if not file.is_file():
+        return None
+    document = load_json(file)
+    settings = document.get("settings") if isinstance(document, dict) else None
+    needed = ("text", "seed", "pipeline_class", "pipeline_sha256")
+    if not isinstance(settings, dict) or any(name not in settings for name in needed):
+        raise InputError(f"{file} is not the record of a text that made a photo; remove it to read the photo alone.")
+    return settings

@@ -126,6 +126,7 @@ def scene_section(out: Path, path: Path) -> dict[str, Any]:
                 "decisions": {stage: record.decisions for stage, record in records.items() if record.decisions},
                 "codes": {stage: record.code_version for stage, record in records.items()},
                 "model": records["sample"].inputs.get("model", "") if "sample" in records else "",
+                "terms": run.generated.attrs.get("terms", "") if "generated" in run else "",
                 "config": run.attrs.get("job", {}).get("config", {}),
                 "plan": _uri((folder / "plan.png").read_bytes()) if (folder / "plan.png").exists() else None,
                 "video": f"{store.scene_id}/{name}/path.mp4" if (folder / "path.mp4").exists() else None,

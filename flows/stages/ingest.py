@@ -50,6 +50,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
             return out
 
         views = list(pool.map(one, range(count)))
+    store.captured.set_attrs(made_from=capture.made_from)
     write_captured(store, capture, job.scene.digests["images"], views)
     decisions = [warning(note) for note in capture.notes]
     if capture.distortion is not None:
