@@ -1,4 +1,4 @@
-"""`cat3d models`: the diffusion models that are installed, and what a size of the network amounts to."""
+"""`cat3d models`: the models that are installed, and what a size of the diffusion network amounts to."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from rich.table import Table
 
 from cat3d_core.diffusion import SIZES, count_flops, count_parameters, describe
 from cat3d_core.diffusion.memory import Need, multiview_need
+from cat3d_core.matching.checkpoint import describe_sweep
 from cat3d_core.seva import network as seva_network
 from cat3d_core.seva.config import SevaConfig
 from cat3d_core.seva.generator import seva_spec
-from cat3d_core.weights import default_model_path
+from cat3d_core.weights import default_model_path, default_sweep_path
 from flows.errors import InputError
 from flows.generation.open import find_format, format_names, recognised
 from flows.progress import console
@@ -29,7 +30,7 @@ def models_command(describe_size: str | None, model: Path | None, as_json: bool)
         report = size_report(describe_size)
         print(json.dumps(report, indent=1)) if as_json else console.print(_pairs(report, f"size {describe_size}"))
         return
-    reports = [model_report(path) for path in installed() + ([model] if model else [])]
+    reports = [model_report(path) for path in installed() + ([model] if model else [])] + sweeps()
     if as_json:
         print(json.dumps(reports, indent=1))
         return
@@ -46,6 +47,15 @@ def installed() -> list[Path]:
         return [default_model_path()]
     except FileNotFoundError:
         return []
+
+
+def sweeps() -> list[dict[str, Any]]:
+    """What the shipped plane sweep's file says of itself, where the installation carries it."""
+    try:
+        path = default_sweep_path()
+    except FileNotFoundError:
+        return []
+    return [{"path": str(path), "bytes": path.stat().st_size, **describe_sweep(path)}]
 
 
 def model_report(path: Path) -> dict[str, Any]:
