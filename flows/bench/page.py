@@ -1,4 +1,4 @@
-"""The page of all benchmarks, from the Parquet tables of their last runs: Markdown and a picture of the fronts of each."""
+"""The page of all benchmarks, from the Parquet tables of their last runs: Markdown, and each with a picture."""
 
 from __future__ import annotations
 
