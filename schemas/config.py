@@ -22,6 +22,7 @@ from pydantic import (
 )
 
 from schemas.errors import ConfigError
+from schemas.hints import HintsConfig
 from schemas.settings import spelled_out
 from schemas.skip import SkipConfig
 from schemas.strict import StrictModel as _Model
@@ -186,6 +187,7 @@ class RunConfig(_Model):
     ingest: IngestConfig = Field(default_factory=IngestConfig)
     poses: PosesConfig = Field(default_factory=PosesConfig)
     plan: PlanConfig = Field(default_factory=PlanConfig)
+    hints: HintsConfig = Field(default_factory=HintsConfig)
     sample: SampleConfig = Field(default_factory=SampleConfig)
     reconstruct: ReconstructConfig = Field(default_factory=ReconstructConfig)
     render: RenderConfig = Field(default_factory=RenderConfig)

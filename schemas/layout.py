@@ -90,7 +90,7 @@ def _cameras(section: str, view: Dim, stage: str) -> tuple[ArraySpec, ...]:
 
 
 _LATENT = (CHANNEL, LATENT_Y, LATENT_X)
-_PLAN, _GENERATED, _RENDERS = "runs/*/plan", "runs/*/generated", "runs/*/renders/*"
+_PLAN, _HINTS, _GENERATED, _RENDERS = "runs/*/plan", "runs/*/hints", "runs/*/generated", "runs/*/renders/*"
 _DONE_RENDER = f"{_RENDERS}/done"
 
 # fmt: off
@@ -131,11 +131,27 @@ LAYOUT: tuple[ArraySpec, ...] = (
               "[x0, y0, width, height] of the sample that shows the scene and not its padding"),
     ArraySpec(f"{_PLAN}/group_views", "small", "int32", (GROUP, SLOT), "plan", "1",
               "views of each group in order, -1 beyond them; repeats where an older plan has group_valid"),
+    ArraySpec(f"{_HINTS}/colour", "image", "uint8", (PLANNED, Y, X, RGB), "match", "sRGB, 0 to 255",
+              "what the photos show of the planned view, mended where they show nothing", done=f"{_HINTS}/done"),
+    ArraySpec(f"{_HINTS}/confidence", "depth", "float16", (PLANNED, Y, X), "match", "1",
+              "trust in the colour, 0 to 1", done=f"{_HINTS}/done"),
+    ArraySpec(f"{_HINTS}/inverse_depth", "depth", "float16", (PLANNED, Y, X), "match", "1 / scene unit",
+              "expected inverse z depth, 0 = infinitely far", done=f"{_HINTS}/done"),
+    ArraySpec(f"{_HINTS}/spread", "depth", "float16", (PLANNED, Y, X), "match", "1 / scene unit",
+              "standard deviation of the inverse depth", done=f"{_HINTS}/done"),
+    ArraySpec(f"{_HINTS}/seen", "depth", "float16", (PLANNED, Y, X), "match", "1",
+              "probability that the place lies inside some photo", done=f"{_HINTS}/done"),
+    _marker(f"{_HINTS}/done", PLANNED, "match"),
+    ArraySpec(f"{_HINTS}/explained", "small", "bool", (PLANNED,), "match", "1",
+              "the photos show the whole view, so that it need not be sampled"),
     ArraySpec(f"{_GENERATED}/latent", "latent", "float16", (PLANNED, *_LATENT), "sample", "1", "sampled latents",
               done=f"{_GENERATED}/done_latent"),
     _marker(f"{_GENERATED}/done_latent", PLANNED, "sample"),
     ArraySpec(f"{_GENERATED}/image", "image", "uint8", (PLANNED, Y, X, RGB), "decode", "sRGB, 0 to 255",
               "decoded latents", done=f"{_GENERATED}/done_image"),
+    ArraySpec(f"{_GENERATED}/confidence", "depth", "float16", (PLANNED, Y, X), "decode", "1",
+              "trust in the image, 0 to 1: the weight of its pixels in the reconstruction",
+              done=f"{_GENERATED}/done_image"),
     _marker(f"{_GENERATED}/done_image", PLANNED, "decode", "; a view that is left out on purpose is written as 0"),
     ArraySpec("runs/*/field/*", "parameter", "float32", None, "reconstruct", "1", "field parameters, training record"),
     ArraySpec(f"{_RENDERS}/image", "image", "uint8", (RENDERED, Y, X, RGB), "render", "sRGB, 0 to 255",

@@ -4,11 +4,22 @@
 `docs/reference/stress.md` for the results.
 """
 
-from cat3d_core.stress import coordinates, diffusion, geometry, intervals, metrics, networks, poses, rendering, training
+from cat3d_core.stress import (
+    coordinates,
+    diffusion,
+    geometry,
+    intervals,
+    matching,
+    metrics,
+    networks,
+    poses,
+    rendering,
+    training,
+)  # fmt: skip
 from cat3d_core.stress.routine import Exact, Routine
 from cat3d_core.stress.search import Finding, stress
 
-_SUBJECTS = (geometry, poses, coordinates, intervals, rendering, training, diffusion, networks, metrics)
+_SUBJECTS = (geometry, poses, coordinates, intervals, rendering, training, diffusion, networks, metrics, matching)
 ROUTINES = [routine for subject in _SUBJECTS for routine in subject.ROUTINES]
 
 __all__ = ["ROUTINES", "Exact", "Finding", "Routine", "stress"]

@@ -257,4 +257,4 @@ def write_tables(page: Path, table: Path) -> None:
 
 
 if __name__ == "__main__":
-    write_tables(Path("docs/explanation/skips.md"), Path("docs/reference/benchmarks/skips.parquet"))
+    write_tables(Path("docs/log/2026-11-28_skips.md"), Path("docs/reference/benchmarks/skips.parquet"))

@@ -20,11 +20,12 @@ from cat3d_core.uncertainty import unseen
 from cat3d_core.view_selection import pose_distance
 from flows.generation.brief import brief_reconstruction, brief_render
 from flows.generation.groups import StoredPlan
+from flows.generation.hints import explained_views
 from flows.generation.open import open_generator
-from flows.generation.views import decoded, in_window
+from flows.generation.views import finished, in_window
 from flows.jobs.access import read_cameras, read_images, views_with_role
 from flows.jobs.job import Job
-from flows.media.images import resize
+from flows.media.images import resize, to_uint8
 from schemas.decisions import chosen as decided
 from schemas.decisions import skipped
 from schemas.scene_store import SceneStore
@@ -109,12 +110,11 @@ class Rounds(OneRound):
         shown = [v for v in self.train if v != self.held_out]
         cameras, images = read_cameras(self.store.captured, shown), read_images(self.store.captured, shown)
         run = self.store.run(self.job.run)
-        generator = open_generator(self.job)
+        generator, explained = open_generator(self.job), explained_views(run)
         windows = self.plan.plan.window.tolist()
         for view in (v for g in groups for v in self.plan.groups[g].targets):
-            camera, image = in_window(
-                self.plan.cameras[view], decoded(generator, run.generated, view)[0], windows[view]
-            )
+            made = to_uint8(finished(self.job, generator, run, view, bool(explained[view]))[0])
+            camera, image = in_window(self.plan.cameras[view], made, windows[view])
             cameras, images = Cameras.cat([cameras, camera]), [*images, image]
         return Views.from_images(cameras, images, torch.arange(len(cameras)) < len(shown))
 

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from flows.generation.groups import view_keys
+from flows.generation.hints import explained_views
 from flows.generation.open import generator_spec, open_generator
-from flows.generation.views import decoded
+from flows.generation.views import finished
 from flows.jobs.job import Job, Outcome
 from flows.jobs.stage import Stage, generates
+from flows.media.images import to_uint8
 from flows.workers.fan_out import fan_out
 from flows.workers.work import Work, is_done
 from schemas.decisions import skipped
@@ -19,8 +21,8 @@ from schemas.scene_store import SceneStore
 
 
 def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
-    """The generator."""
-    return {"model": generator_spec(job).identity}
+    """The generator, and whether its views are put together with what photos show."""
+    return {"model": generator_spec(job).identity} | ({"hints": True} if job.hinted else {})
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
@@ -30,8 +32,11 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     views, (width, height) = generated.shape("latent")[0], generator_spec(job).image_size
     generated.create_array("image", (views, height, width, 3))
     generated.create_array("done_image", (views, 32))
-    sampled = np.flatnonzero(generated.read("done_latent").any(-1)).tolist()
-    left_out = sorted(set(range(views)) - set(sampled))
+    if job.hinted:
+        generated.create_array("confidence", (views, height, width))
+    explained = explained_views(store.run(job.run))
+    wanted = np.flatnonzero(generated.read("done_latent").any(-1) | explained).tolist()
+    left_out = sorted(set(range(views)) - set(wanted))
     generated.mark_skipped("done_image", left_out)
     text = f"Skipped decoding {len(left_out)} of {views} views: they were not sampled."
     decisions = [skipped(text, views=len(left_out))] if left_out else []
@@ -46,7 +51,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
         "done_image",
         "image",
         view_keys(key, views),
-        [sampled],
+        [wanted],
         each,
     )
     missing = len(share.passes[0])
@@ -57,13 +62,18 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
 
 def work(job: Job, store: SceneStore, key: str, items: Sequence[int]) -> None:
     """A worker's share: decode the views `items`, one at a time."""
-    generated = store.run(job.run).generated
+    run = store.run(job.run)
+    generated = run.generated
     generator = open_generator(job)
     keys = view_keys(key, generated.shape("latent")[0])
+    explained = explained_views(run)
     for view in items:
         if is_done(generated, "done_image", view, keys[view], "image"):
             continue
-        generated.write_views("image", decoded(generator, generated, view), [view])
+        image, trust = finished(job, generator, run, view, bool(explained[view]))
+        if trust is not None:
+            generated.write_views("confidence", trust.half().numpy()[None], [view])
+        generated.write_views("image", to_uint8(image)[None], [view])
         generated.mark_done("done_image", [keys[view]], [view])
 
 

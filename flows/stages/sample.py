@@ -13,6 +13,7 @@ from cat3d_core.generation import Cost, MemoryTooSmall
 from cat3d_core.plan import Group
 from flows.errors import WorkerError
 from flows.generation.groups import StoredPlan, view_keys
+from flows.generation.hints import explained_views
 from flows.generation.open import generator_spec, open_generator
 from flows.generation.rounds import OneRound, Rounds
 from flows.generation.sampling import sampler_config, sampler_settings
@@ -40,17 +41,19 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     """
     run = store.run(job.run)
     plan = StoredPlan(store, run, job.config.seed)
+    explained = explained_views(run)
     rounds = Rounds(job, store, plan, sampling_flops(job, plan)) if job.config.skip.rounds else OneRound(plan)
     totals, groups, spared = Totals(), [], set(range(len(plan.groups)))
-    for passes in rounds:
-        spared -= {g for items in passes for g in items}
+    for planned in rounds:
+        spared -= {g for items in planned for g in items}
+        passes = [[g for g in items if not explained[plan.groups[g].targets[0]]] for items in planned]
         share = sample_work(job, store, key, passes)
         groups += [g for items in share.passes for g in items]
         label = f"sample {job.scene_id} {job.run}"
         totals += fan_out([share], job.config.execution, label, here=job.config.skip.workers)
     made = {view for g in rounds.kept for view in plan.groups[g].targets}
     left_out = sorted(set(range(len(plan))) - made)
-    run.generated.mark_skipped("done_latent", left_out)
+    run.generated.mark_skipped("done_latent", [v for v in range(len(plan)) if v not in made or explained[v]])
     decisions = []
     if left_out:
         saved = sum(
@@ -59,7 +62,15 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
         text = f"{len(left_out)} of {len(plan)} planned views were left out; {saved} network evaluations were saved."
         switch = "rounds" if plan.needed else "covered_path"
         decisions.append(skipped(text, switch, views=len(left_out), evaluations=saved))
-    decisions += rounds.decisions + sampler_decisions(job, plan, rounds.kept) + totals.decisions
+    sampled = [g for g in rounds.kept if not explained[plan.groups[g].targets[0]]]
+    if len(sampled) < len(rounds.kept):
+        shown = sorted(set(rounds.kept) - set(sampled))
+        saved = sum(
+            group_cost(job, plan.groups[g], group_sampler(job, plan, plan.groups[g])).evaluations for g in shown
+        )
+        text = f"{len(shown)} of {len(rounds.kept)} groups were not sampled, since photos show all of their views; "
+        decisions.append(skipped(f"{text}{saved} network evaluations were saved.", "explained", evaluations=saved))
+    decisions += rounds.decisions + sampler_decisions(job, plan, sampled) + totals.decisions
     configs = [group_sampler(job, plan, plan.groups[g]) for g in groups]
     counts = {"views": sum(len(plan.groups[g].targets) for g in groups), "groups": len(groups)}
     spent = sum(group_cost(job, plan.groups[g], c).evaluations for g, c in zip(groups, configs, strict=True))
@@ -148,7 +159,7 @@ STAGE = Stage(
     "sample",
     execute,
     version=1,
-    reads=("plan", "encode"),
+    reads=("plan", "match", "encode"),
     settings=settings_of("sample", "seed", without=("generator", "checkpoint")),  # its identity is among the inputs
     inputs=inputs,
     wanted=generates,

@@ -22,8 +22,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.diffusion import SamplerConfig, load_model
-from cat3d_core.generation import Cat3dGenerator, Generator, generate
+from cat3d_core.diffusion import SamplerConfig
+from cat3d_core.generation import Generator, generate
 from cat3d_core.generation.advice import FEW_STEPS, MANY_STEPS
 from cat3d_core.metrics.perceptual import PerceptualDistance, find_perceptual
 from cat3d_core.metrics.psnr import psnr
@@ -37,12 +37,15 @@ from cat3d_core.synthetic.held_out import held_out_group
 from cat3d_core.synthetic.tracer import Traced
 from cat3d_core.view_selection import camera_distance
 from flows.errors import InputError
+from flows.generation.formats import cat3d
 from flows.jobs.device import device
 from flows.media.images import read_image, square_image, write_png
 from flows.readers.base import read_capture
+from flows.training.worlds.held_out import held_out_worlds
 
 CAPTURED = ("llff_fern", "dtu_scan24", "co3d_apple", "re10k_bedroom", "mipnerf360_bonsai", "fox")
 ALL_CAPTURED = "all captured"
+WORLDS = "held-out worlds"
 
 
 def warp(traced: Traced, cameras: Cameras, target: int, sources: list[int]) -> tuple[Tensor, Tensor]:
@@ -119,10 +122,11 @@ def rows(
     perceptual: PerceptualDistance | None = None,
     pictures: Path | None = None,
     captured: Sequence[Path] = (),
+    worlds: Path | None = None,
 ) -> list[dict[str, Any]]:
-    """One row per family (and "all"), captured scene, number of conditioning views and method: mean PSNR, SSIM
-    (gaussian, valid) and, where a network is given, its distance, over all target views. pictures: a folder for contact
-    sheets."""
+    """One row per family (and "all"), captured scene, the held-out worlds of a folder, number of conditioning views
+    and method: mean PSNR, SSIM (gaussian, valid) and, where a network is given, its distance, over all target views.
+    pictures: a folder for contact sheets."""
     sampler, size, views = sampler or FEW_STEPS, generator.spec.image_size[0], generator.spec.views
     scores: dict[tuple, list[dict[str, float]]] = defaultdict(list)
 
@@ -146,6 +150,16 @@ def rows(
                 take((family, "all"), given, images)
                 if pictures is not None and number < 3:
                     _contact_sheet(pictures / f"{family}_{number}_{given}.png", traced.image[:given], images)
+    for world in held_out_worlds(worlds, views) if worlds else ():
+        image = F.interpolate(world.image, (size, size), mode="area")
+        traced = Traced(image, F.interpolate(world.depth[:, None], (size, size))[:, 0], torch.zeros_like(image))
+        cameras = world.cameras.resize(size, size)
+        for given in conditions:
+            images = evaluate_group(generator, image, cameras, given, sampler, (world.name,))
+            images["warp"] = warped(traced, cameras, given)
+            take((WORLDS,), given, images)
+            if pictures is not None:
+                _contact_sheet(pictures / f"world_{world.name}_{given}.png", image[:given], images)
     for scene in captured:
         for given in conditions:
             image, cameras = captured_group(scene, size, given, views)
@@ -194,14 +208,14 @@ def evaluate_file(
     sampler: SamplerConfig = FEW_STEPS,
     pictures: Path | None = None,
     data: Path | None = None,
+    worlds: Path | None = None,
 ) -> str:
     """Markdown tables of PSNR, SSIM and (where weights are found) perceptual distance of a model file."""
     perceptual = find_perceptual()
-    model = load_model(path).to(device())
-    model.unet = model.unet.to(torch.bfloat16)
+    generator = cat3d.load(path, device(), "bfloat16")
     result = rows(
-        Cat3dGenerator(model), scenes, sampler=sampler, perceptual=perceptual, pictures=pictures,
-        captured=captured_scenes(data),
+        generator, scenes, sampler=sampler, perceptual=perceptual, pictures=pictures,
+        captured=captured_scenes(data), worlds=worlds,
     )  # fmt: skip
     return "\n\n".join(table(result, m) for m in ("psnr", "ssim", *([perceptual.name] if perceptual else [])))
 
@@ -213,10 +227,11 @@ def main() -> None:
     parser.add_argument("--many-steps", action="store_true", help="UniPC with 20 steps instead of DDIM with 4")
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--data", type=Path, help=f"folder with captured scenes: {', '.join(CAPTURED)}")
+    parser.add_argument("--worlds", type=Path, help="folder of held-out worlds (cat3d worlds PACKAGE --held-out DIR)")
     options = parser.parse_args()
     torch.set_num_threads(1)
     sampler = MANY_STEPS if options.many_steps else FEW_STEPS
-    print(evaluate_file(options.model, options.scenes, sampler, options.pictures, options.data))
+    print(evaluate_file(options.model, options.scenes, sampler, options.pictures, options.data, options.worlds))
 
 
 if __name__ == "__main__":

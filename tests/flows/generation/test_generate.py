@@ -108,8 +108,8 @@ def test_wide_samples_are_planned_encoded_and_kept_without_their_padding(model: 
     assert not torch.equal(square, wide)
     run_stages(job, "sample", "decode")
     views = list(generated_views(run_of(job)))
-    assert [tuple(image.shape) for _, image in views] == [(64, 64, 3)] * 5 + [(48, 64, 3)] * 5
-    for (narrow, _), (broad, _) in zip(views[:5], views[5:]):
+    assert [tuple(view.image.shape) for view in views] == [(64, 64, 3)] * 5 + [(48, 64, 3)] * 5
+    for narrow, broad in zip((v.camera for v in views[:5]), (v.camera for v in views[5:])):
         assert torch.equal(narrow.world_from_camera, broad.world_from_camera)
         # The same sky: 24 rows of the photo are 64 rows of the square sample and 48 of the wide one.
         assert torch.allclose(narrow.intrinsics[0, 1, 1] / 64, broad.intrinsics[0, 1, 1] / 48)

@@ -136,8 +136,8 @@ def test_without_skips_every_stage_is_the_plain_core_bit_for_bit(model: Path, tm
         torch.set_num_threads(threads)
     made = list(generated_views(run))
     assert len(made) == VIEWS
-    cameras = Cameras.cat([captured, *(camera for camera, _ in made)])
-    images = [*read_images(store.captured, train), *(image for _, image in made)]
+    cameras = Cameras.cat([captured, *(view.camera for view in made)])
+    images = [*read_images(store.captured, train), *(view.image for view in made)]
     views = Views.from_images(cameras, images, torch.arange(len(cameras)) < 3)
     trainer = Trainer(trainer_config(one), views, one.config.seed)
     while not trainer.finished:

@@ -27,12 +27,13 @@ def _processor() -> str:
 
 
 def _compile(name: str) -> Path:
-    """Path of the shared library of this folder's NAME.cpp for this processor, compiled where the cache lacks it."""
-    source = Path(__file__).with_name(f"{name}.cpp")
+    """Path of the shared library of this package's NAME.cpp (such as zipnerf/hash_grid) for this processor, compiled
+    where the cache lacks it."""
+    source = Path(__file__).parent / f"{name}.cpp"
     compiler = os.environ.get("CXX", "g++")
     key = hashlib.sha256(source.read_bytes() + repr((compiler, _FLAGS, _processor())).encode()).hexdigest()[:24]
     folder = Path(os.environ.get("CAT3D_CACHE") or Path.home() / ".cache" / "cat3d")
-    library = folder / f"{name}-{key}.so"
+    library = folder / f"{source.stem}-{key}.so"
     if not library.exists():
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
