@@ -18,54 +18,44 @@ app = typer.Typer(
 )
 
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for stores, tables, pictures and the report.")]
+DownscaleOption = Annotated[float, typer.Option(help="Divide image width and height by this.")]
+SeedOption = Annotated[int, typer.Option(help="All randomness follows from it.")]
+ReaderOption = Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")]
+ImagesOption = Annotated[str | None, typer.Option(help="Image folder inside the scene, where there are several.")]
+SetOption = Annotated[list[str] | None, typer.Option("--set", help="One setting, e.g. plan.views=30. May be repeated.")]
+ConfigOption = Annotated[Path | None, typer.Option(help="Settings from a YAML or JSON file; options here win.")]
 
 
 @app.command()
 def run(
-    source: Annotated[
-        str, typer.Argument(help="A scene's folder (any supported layout, or just photos), or procedural:FAMILY/SEED.")
-    ] = "",
+    source: Annotated[str, typer.Argument(help="A scene's folder, or just photos, or procedural:FAMILY/SEED.")] = "",
     out: OutOption = Path("outputs"),
     prompt: Annotated[str, typer.Option(help="Text instead of a folder: what the scene's one photo shows.")] = "",
-    text_to_image: Annotated[
-        Path | None, typer.Option(help="For --prompt: folder of a diffusers text-to-image pipeline.")
-    ] = None,
-    text_steps: Annotated[int | None, typer.Option(help="Its steps; without it the pipeline's own number.")] = None,
-    text_guidance: Annotated[float | None, typer.Option(help="Its guidance, likewise.")] = None,
-    text_size: Annotated[int | None, typer.Option(help="Side of its picture in pixels, likewise.")] = None,
-    views: Annotated[
-        str, typer.Option(help="Training views: counts with a split of the data set, or all; several by commas.")
-    ] = "all",
-    downscale: Annotated[float, typer.Option(help="Divide image width and height by this.")] = 1,
-    method: Annotated[
-        str, typer.Option(help="zipnerf: captured views only; cat3d: with generated views; auto: cat3d for one photo.")
-    ] = "auto",
+    text_to_image: Annotated[Path | None, typer.Option(help="Folder of a diffusers pipeline for --prompt.")] = None,
+    text_settings: Annotated[str, typer.Option(help="Its settings, e.g. {steps: 20, guidance: 5, side: 512}.")] = "",
+    views: Annotated[str, typer.Option(help="Training views: counts of a split, or all; several by commas.")] = "all",
+    downscale: DownscaleOption = 1,
+    method: Annotated[str, typer.Option(help="zipnerf: photos; cat3d: and generated views; auto: by number.")] = "auto",
     preset: Annotated[str, typer.Option(help="reconstruction preset: tiny, fast, balanced, paper.")] = "fast",
-    seed: Annotated[int, typer.Option(help="All randomness follows from it.")] = 0,
-    model: Annotated[
-        Path | None, typer.Option(help="A generator's file or folder instead of the shipped model.")
-    ] = None,
-    reader: Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")] = "auto",
-    images: Annotated[str | None, typer.Option(help="Image folder inside the scene, where there are several.")] = None,
-    config: Annotated[Path | None, typer.Option(help="Settings from a YAML or JSON file; options here win.")] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="One setting, e.g. --set render.path_views=30. May be repeated.")
-    ] = None,
+    seed: SeedOption = 0,
+    model: Annotated[Path | None, typer.Option(help="A generator's file or folder, not the shipped model.")] = None,
+    reader: ReaderOption = "auto",
+    images: ImagesOption = None,
+    config: ConfigOption = None,
+    set_: SetOption = None,
 ) -> None:
     """Photos in, 3D scene out: renders, metrics and a report. Stages that are done already are not done again."""
+    if bool(prompt) == bool(source) or bool(prompt) != (text_to_image is not None):
+        raise typer.BadParameter("Give the scene's folder, or --prompt and --text-to-image.")
     from flows.commands.run import run_command
     from flows.jobs.request import make_request
 
-    given = {"downscale": downscale, "method": method, "preset": preset, "seed": seed}
-    if model is not None:
-        given["model"] = str(model.resolve())
-    if bool(prompt) == bool(source) or bool(prompt) != (text_to_image is not None):
-        raise typer.BadParameter("Give the scene's folder, or --prompt and --text-to-image.")
+    given: dict[str, Any] = {"downscale": downscale, "method": method, "preset": preset, "seed": seed}
+    given |= {"model": str(model.resolve())} if model else {}
     if text_to_image is not None:
-        from flows.generation.text import Prompt, text_to_photo
+        from flows.generation.text import make_prompt, text_to_photo
 
-        asked = Prompt(prompt, text_to_image, seed, text_steps, text_guidance, text_size)
-        source = str(text_to_photo(asked, out.resolve()))
+        source = str(text_to_photo(make_prompt(prompt, text_to_image, seed, text_settings), out.resolve()))
     run_command(make_request(source, out, views, given, reader, images, config, set_ or []))
 
 
@@ -89,22 +79,22 @@ def plan(
         str, typer.Option(help="auto, single_spiral, single_orbit, realestate10k, llff, dtu, co3d or mipnerf360.")
     ] = "auto",
     count: Annotated[int | None, typer.Option(help="Views to generate; without it the recipe's own number.")] = None,
-    downscale: Annotated[float, typer.Option(help="Divide image width and height by this.")] = 1,
-    seed: Annotated[int, typer.Option(help="All randomness follows from it.")] = 0,
+    downscale: DownscaleOption = 1,
+    seed: SeedOption = 0,
     model: Annotated[Path | None, typer.Option(help="Plan for this model's file or folder.")] = None,
-    reader: Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")] = "auto",
-    images: Annotated[str | None, typer.Option(help="Image folder inside the scene, where there are several.")] = None,
-    config: Annotated[Path | None, typer.Option(help="Settings from a YAML or JSON file; options here win.")] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", help="One setting, as for run. May be repeated.")] = None,
+    reader: ReaderOption = "auto",
+    images: ImagesOption = None,
+    config: ConfigOption = None,
+    set_: SetOption = None,
     rows: Annotated[int, typer.Option(help="Groups to print at most.")] = 24,
 ) -> None:
     """Which views would be generated, how they are grouped and on what they are conditioned: a table and a picture."""
     from flows.commands.plan import plan_command
     from flows.jobs.request import make_request
 
-    given = {"method": "cat3d", "downscale": downscale, "seed": seed, "trajectory": trajectory, "count": count}
-    if model is not None:
-        given["model"] = str(model.resolve())
+    given: dict[str, Any] = {"method": "cat3d", "downscale": downscale, "seed": seed}
+    given |= {"trajectory": trajectory, "count": count}
+    given |= {"model": str(model.resolve())} if model else {}
     plan_command(make_request(source, out, views, given, reader, images, config, set_ or []), rows)
 
 
@@ -127,7 +117,7 @@ def export(
     store: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder) with a finished run.")],
     run_name: Annotated[str | None, typer.Option("--run", help="The run, where the store has several.")] = None,
     what: Annotated[
-        str, typer.Option(help="mesh, points, dataset, renders, plan; several by commas. The first three if not given.")
+        str, typer.Option(help="mesh, points, dataset (these if not given), renders, plan; by commas.")
     ] = "",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the exports.")] = Path("exports"),
     frame: Annotated[

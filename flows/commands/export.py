@@ -54,8 +54,7 @@ def export_command(
     settings: SurfaceSettings | None = None,
     path_file: Path | None = None,
 ) -> list[Path]:
-    """Write what is asked for (comma-separated KINDS; mesh, points and dataset if empty) to `out`; returns the files
-    and folders made.
+    """Write what is asked for (comma-separated KINDS; mesh, points and dataset if empty) to `out`; what was made.
 
     Raises InputError for everything a user can correct.
     """

@@ -19,7 +19,8 @@ from cat3d_core.cameras import Cameras
 from flows.errors import InputError
 from flows.jobs.job import Job
 from flows.jobs.scene import file_sha256
-from flows.media.images import image_size, list_images, read_image
+from flows.media.files import image_size, list_images
+from flows.media.images import read_image
 from schemas.errors import MissingError
 from schemas.scene_store import Run, SceneStore
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import yaml
 
 from cat3d_core.random import derive_seed
 from flows.errors import InputError
@@ -24,6 +25,7 @@ from flows.jobs.scene import file_sha256
 from flows.media.images import write_png
 from flows.progress import console
 from flows.readers.photos import PROMPT_SETTINGS as SETTINGS
+from schemas.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,19 @@ class Prompt:
     steps: int | None = None
     guidance: float | None = None
     side: int | None = None
+
+
+def make_prompt(text: str, pipeline: Path, seed: int, settings: str) -> Prompt:
+    """What the command line asks for; settings: YAML such as {steps: 20, side: 512}. Raises ConfigError."""
+    try:
+        document = yaml.safe_load(settings) or {}
+    except yaml.YAMLError as error:
+        raise ConfigError(f"--text-settings is not valid YAML: {' '.join(str(error).split())}.") from None
+    for name, value in document.items() if isinstance(document, dict) else [(settings, None)]:
+        fits = isinstance(value, (int, float) if name == "guidance" else int) and not isinstance(value, bool)
+        if name not in ("steps", "guidance", "side") or not fits or float(value or 0) <= 0:
+            raise ConfigError(f"--text-settings: {name} must be one of steps, guidance, side, with a positive number.")
+    return Prompt(text, pipeline, seed, **document)
 
 
 def text_to_photo(prompt: Prompt, out: Path) -> Path:

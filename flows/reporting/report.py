@@ -99,7 +99,7 @@ def gallery(scenes: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]) ->
         name = best.get(scene["id"])
         shown = {run["name"] for run in scene["runs"] if run["views"]}
         if name is not None and name in shown:
-            rival = beside.get((scene["id"], name))
+            rival: str | None = beside.get((str(scene["id"]), str(name)))
             out.append({"scene": scene["id"], "run": name, "rival": rival if rival in shown else None})
     return out
 
