@@ -115,12 +115,10 @@ class Plan:
         return len(self.cameras)
 
     def passes(self) -> list[list[int]]:
-        """Numbers of the groups that can be sampled at the same time, in order: those of anchors, then the others; none
-        where nothing need be generated."""
-        if not self.needed:
-            return []
-        first = [g for g, group in enumerate(self.groups) if group.anchors]
-        return [p for p in (first, [g for g, group in enumerate(self.groups) if not group.anchors]) if p]
+        """Numbers of the groups that can be sampled at the same time: those of anchors, then the others, if needed."""
+        numbers = range(len(self.groups)) if self.needed else ()
+        first, rest = ([g for g in numbers if self.groups[g].anchors == anchors] for anchors in (True, False))
+        return [p for p in (first, rest) if p]
 
     def among(self, views: Sequence[int], count: int) -> Plan:
         """The same plan where its captured view i is number views[i] of `count` captured views."""

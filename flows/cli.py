@@ -10,20 +10,17 @@ from typing import Annotated, Any
 
 import typer
 
-app = typer.Typer(
-    help="3D scenes from a handful of photos: an open, batch implementation of the CAT3D paper.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
+import flows.cli_develop  # noqa: F401  (registers its commands)
+from flows.cli_app import (
+    ConfigOption,
+    DownscaleOption,
+    ImagesOption,
+    OutOption,
+    ReaderOption,
+    SeedOption,
+    SetOption,
+    app,
 )
-
-OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for stores, tables, pictures and the report.")]
-DownscaleOption = Annotated[float, typer.Option(help="Divide image width and height by this.")]
-SeedOption = Annotated[int, typer.Option(help="All randomness follows from it.")]
-ReaderOption = Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")]
-ImagesOption = Annotated[str | None, typer.Option(help="Image folder inside the scene, where there are several.")]
-SetOption = Annotated[list[str] | None, typer.Option("--set", help="One setting, e.g. plan.views=30. May be repeated.")]
-ConfigOption = Annotated[Path | None, typer.Option(help="Settings from a YAML or JSON file; options here win.")]
 
 
 @app.command()
@@ -217,80 +214,6 @@ def results(
     from flows.commands.results import results_command
 
     raise typer.Exit(1 if results_command(out, against, bound, bound_rest) else 0)
-
-
-@app.command()
-def train(
-    config: Annotated[
-        str, typer.Argument(help="A training's YAML file, or the name of a shipped preset (see --list).")
-    ] = "",
-    out: OutOption = Path("outputs/training"),
-    list_: Annotated[bool, typer.Option("--list", help="List the shipped presets.")] = False,
-    steps: Annotated[int | None, typer.Option(help="Optimizer steps, instead of the configuration's.")] = None,
-    minutes: Annotated[float | None, typer.Option(help="Or the time spent in training.")] = None,
-    autoencoder: Annotated[Path | None, typer.Option(help="Take the autoencoder of this file.")] = None,
-    start: Annotated[Path | None, typer.Option(help="Weights to start from.")] = None,
-    seed: Annotated[int | None, typer.Option(help="All randomness follows from it.")] = None,
-    device: Annotated[str | None, typer.Option(help="auto, cpu or cuda.")] = None,
-    bank_only: Annotated[bool, typer.Option("--bank-only", help="Only make what is trained on.")] = False,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="One setting, e.g. --set optimizer.groups=8. May be repeated.")
-    ] = None,
-) -> None:
-    """Train a multi-view diffusion model on procedural scenes; run again, it goes on where it was stopped."""
-    from flows.commands.train import train_command
-
-    path = str(autoencoder) if autoencoder else None
-    given: dict[str, Any] = {"steps": steps, "minutes": minutes, "seed": seed, "device": device}
-    given |= {"start": str(start) if start else None} | ({"autoencoder": {"path": path}} if path else {})
-    train_command(config, out, given, set_ or [], list_, bank_only)
-
-
-@app.command()
-def worlds(
-    package: Annotated[Path, typer.Argument(help="Folder for Debian's supertuxkart-data; fetched if not there yet.")],
-    held_out: Annotated[
-        Path | None, typer.Option(help="Photograph the held-out tracks into this folder, to evaluate models on.")
-    ] = None,
-    groups: Annotated[int, typer.Option(help="How many held-out groups of cameras, at least.")] = 60,
-    views: Annotated[int, typer.Option(help="Cameras of a held-out group.")] = 10,
-    size: Annotated[int, typer.Option(help="Side of their pictures in pixels.")] = 128,
-) -> None:
-    """Fetch textured worlds to train on (628 MB, nothing is installed), and list their licences."""
-    from flows.commands.worlds import worlds_command
-
-    worlds_command(package, held_out, groups, views, size)
-
-
-@app.command()
-def stress(
-    quick: Annotated[bool, typer.Option("--quick", help="Under a minute: a few thousand cases a routine.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
-    only: Annotated[str, typer.Option(help="Only routines with this in their name, e.g. ssim or solvers.unipc.")] = "",
-    seed: Annotated[int, typer.Option(help="Another seed searches elsewhere.")] = 0,
-) -> None:
-    """Search the worst relative error of every numerical routine; exit code 1 when a bound is broken."""
-    from flows.commands.stress import stress_command
-
-    stress_command(quick, as_json, only, seed)
-
-
-@app.command()
-def bench(
-    name: Annotated[str, typer.Argument(help="A benchmark, or all; without it they are listed.")] = "",
-    quick: Annotated[bool, typer.Option("--quick", help="Small sizes: all of them in minutes on two cores.")] = False,
-    data: Annotated[Path | None, typer.Option(help="Folder of real scenes, for what needs them.")] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", "-o", help="Folder for benchmarks.md and benchmarks/NAME.parquet; docs/reference in a checkout."
-        ),
-    ] = None,
-) -> None:
-    """Run time against error for every stage: tables, fronts, and where the defaults stand on them."""
-    from flows.commands.bench import bench_command
-
-    raise typer.Exit(1 if bench_command(name, quick, data, out) else 0)
 
 
 def main() -> None:

@@ -24,7 +24,7 @@ PENDING = {
 LONGEST_FILE = 300
 #: Modules from a command down to the core, both counted, at most. At commit 0888913 it was 44: modules on a circle all
 #: need each other, and with the stages that were imported by name one circle was 14 modules long.
-LONGEST_CHAIN = 21
+LONGEST_CHAIN = 23
 
 
 def module_name(path: Path) -> str:
