@@ -117,8 +117,8 @@ class Plan:
     def passes(self) -> list[list[int]]:
         """Numbers of the groups that can be sampled at the same time: those of anchors, then the others, if needed."""
         numbers = range(len(self.groups)) if self.needed else ()
-        first, rest = ([g for g in numbers if self.groups[g].anchors == anchors] for anchors in (True, False))
-        return [p for p in (first, rest) if p]
+        parts = ([g for g in numbers if self.groups[g].anchors == anchors] for anchors in (True, False))
+        return [part for part in parts if part]
 
     def among(self, views: Sequence[int], count: int) -> Plan:
         """The same plan where its captured view i is number views[i] of `count` captured views."""
