@@ -95,8 +95,7 @@ class Plan:
     as the plan saw it (None where an older program stored the plan). captured_count: V. captured_coverage,
     plan_coverage: before and after (captured and planned views together). needed: False where captured views cover the
     path already (`PlanConfig.covered_share`): sample nothing. dropped: views of the path that add nothing to the
-    coverage and are not among the N.
-    """
+    coverage and are not among the N."""
 
     cameras: Cameras
     path: Tensor
@@ -117,8 +116,8 @@ class Plan:
     def passes(self) -> list[list[int]]:
         """Numbers of the groups that can be sampled at the same time: those of anchors, then the others, if needed."""
         numbers = range(len(self.groups)) if self.needed else ()
-        parts = ([g for g in numbers if self.groups[g].anchors == anchors] for anchors in (True, False))
-        return [part for part in parts if part]
+        parts = ([g for g in numbers if self.groups[g].anchors == first] for first in (True, False))
+        return list(filter(None, parts))
 
     def among(self, views: Sequence[int], count: int) -> Plan:
         """The same plan where its captured view i is number views[i] of `count` captured views."""
@@ -292,10 +291,10 @@ def _windows(
     """The same in windows of both passes, the nearest captured views in each."""
     layout = lay_out(path.tolist(), len(captured), config.views)
     passes = ((layout.first, len(captured), bool(layout.second)), (layout.second, layout.given, False))
-    groups = []
+    groups, count = [], len(captured) + first
     for windows, slots, of_anchors in passes:
         for anchors, targets in windows:
             known = sorted(nearest_views(cameras[targets], captured, slots, frame.distance))
-            conditions = (*known, *(len(captured) + first + anchor for anchor in anchors))
+            conditions = (*known, *(count + anchor for anchor in anchors))
             groups.append(Group(tuple(first + view for view in targets), conditions, kind, of_anchors))
     return groups
