@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from cat3d_core.nerf.coordinates import contract, contracted_std
-from cat3d_core.nerf.cpu_library import library, pointer
+from cat3d_core.cpu_library import library, pointer
 from cat3d_core.rays import Rays
 
 # Around the cone in an order that decorrelates angle from depth (Zip-NeRF's 'hexify'); three samples take every second
@@ -109,7 +109,7 @@ def grid_samples(
     """`grid_samples_reference`, with the same random numbers, by the C++ kernel for float32 on the CPU where there is a
     compiler. No gradient."""
     with torch.no_grad():
-        kernels = library("cone_samples") if t.dtype == torch.float32 and t.device.type == "cpu" else None
+        kernels = library("nerf/cone_samples") if t.dtype == torch.float32 and t.device.type == "cpu" else None
         if kernels is None:
             return grid_samples_reference(rays, t, count, generator)
         turns = _turns(count, t)

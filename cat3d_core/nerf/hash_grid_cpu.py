@@ -9,13 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cat3d_core.nerf.cpu_library import library, pointer
+from cat3d_core.cpu_library import library, pointer
 from cat3d_core.nerf.hash_grid import GridLayout
 
 
 def available() -> bool:
     """Whether the kernel is there; compiles it at the first call and warns once where that fails."""
-    return library("hash_grid") is not None
+    return library("nerf/hash_grid") is not None
 
 
 @functools.cache
@@ -37,7 +37,7 @@ def _call(
     weights: Tensor | None,
     layout: GridLayout,
 ) -> None:
-    kernels = library("hash_grid")
+    kernels = library("nerf/hash_grid")
     assert kernels is not None
     status = kernels.hash_grid(
         ctypes.c_int(backward), pointer(source), pointer(positions), pointer(std), pointer(out), pointer(weights),

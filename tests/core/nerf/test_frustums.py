@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from cat3d_core.nerf import frustums
-from cat3d_core.nerf.cpu_library import library
+from cat3d_core.cpu_library import library
 from cat3d_core.nerf.frustums import (
     cone_samples,
     grid_samples,
@@ -82,7 +82,7 @@ def test_other_counts_are_refused() -> None:
         cone_samples(torch.zeros(1, 3), torch.ones(1, 3), torch.ones(1, 1), torch.tensor([[0.0, 1.0]]), 4)
 
 
-@pytest.mark.skipif(library("cone_samples") is None, reason="There is no C++ compiler here.")
+@pytest.mark.skipif(library("nerf/cone_samples") is None, reason="There is no C++ compiler here.")
 @pytest.mark.parametrize("count", [3, 6])
 @pytest.mark.parametrize("intervals", [1, 16, 37])
 @pytest.mark.parametrize("seed", [None, 0])
@@ -108,7 +108,7 @@ def test_cpu_kernel_matches_float64(count: int, intervals: int, seed: int | None
     torch.testing.assert_close(std.double(), exact_std, rtol=2e-5, atol=1e-12)
 
 
-@pytest.mark.skipif(library("cone_samples") is None, reason="There is no C++ compiler here.")
+@pytest.mark.skipif(library("nerf/cone_samples") is None, reason="There is no C++ compiler here.")
 def test_cpu_kernel_draws_as_the_reference_and_passes_nan_on() -> None:
     rays = Rays(torch.zeros(4, 3), torch.eye(3)[[0, 1, 2, 2]], torch.full((4, 1), 0.01))
     t = torch.linspace(0.1, 3, 20).expand(4, 20).contiguous()

@@ -27,12 +27,12 @@ def _processor() -> str:
 
 
 def _compile(name: str) -> Path:
-    """Path of the shared library of this folder's NAME.cpp for this processor, compiled where the cache lacks it."""
-    source = Path(__file__).with_name(f"{name}.cpp")
+    """Path of the shared library of the core's NAME.cpp for this processor, compiled where the cache lacks it."""
+    source = Path(__file__).parent / f"{name}.cpp"
     compiler = os.environ.get("CXX", "g++")
     key = hashlib.sha256(source.read_bytes() + repr((compiler, _FLAGS, _processor())).encode()).hexdigest()[:24]
     folder = Path(os.environ.get("CAT3D_CACHE") or Path.home() / ".cache" / "cat3d")
-    library = folder / f"{name}-{key}.so"
+    library = folder / f"{source.stem}-{key}.so"
     if not library.exists():
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
@@ -62,7 +62,7 @@ def _warn(problem: str) -> None:
 
 
 def library(name: str) -> ctypes.CDLL | None:
-    """The kernels of NAME.cpp; compiles them at the first call. None where that fails, with one warning."""
+    """The kernels of the core's NAME.cpp, such as "nerf/hash_grid"; compiles them at the first call. None where that fails, with one warning."""
     found = _load(name)
     if isinstance(found, str):
         _warn(found)
