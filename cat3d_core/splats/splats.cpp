@@ -153,8 +153,9 @@ template <typename R>
 inline Row<R> select(Mask<R> mask, Row<R> value) { return (Row<R>)((Mask<R>)value & mask); }
 template <typename V>
 inline bool any(V mask) {
-    auto all = mask[0];
-    for (int i = 1; i < TILE; ++i) all |= mask[i];
+    uint64_t words[sizeof(V) / 8], all = 0;
+    std::memcpy(words, &mask, sizeof(V));
+    for (uint64_t word : words) all |= word;
     return all != 0;
 }
 template <typename R>
