@@ -43,7 +43,7 @@ def run(
     ] = None,
 ) -> None:
     """Photos in, 3D scene out: renders, metrics and a report. Stages that are done already are not done again."""
-    from flows.run_command import run_command
+    from flows.commands.run import run_command
 
     given = {"downscale": downscale, "method": method, "preset": preset, "seed": seed}
     if model is not None:
@@ -57,7 +57,7 @@ def demo(
     smallest: Annotated[bool, typer.Option("--smallest", help="As small as it gets, for CI.")] = False,
 ) -> None:
     """One small procedural scene from nothing to a report, in minutes on two cores."""
-    from flows.run_command import demo_command
+    from flows.commands.run import demo_command
 
     demo_command(out, smallest)
 
@@ -80,7 +80,7 @@ def plan(
     rows: Annotated[int, typer.Option(help="Groups to print at most.")] = 24,
 ) -> None:
     """Which views would be generated, how they are grouped and on what they are conditioned: a table and a picture."""
-    from flows.plan_command import plan_command
+    from flows.commands.plan import plan_command
 
     given = {"downscale": downscale, "seed": seed, "trajectory": trajectory, "count": count}
     plan_command(source, out, views.split(","), given, reader, images, config, set_ or [], rows)
@@ -93,7 +93,7 @@ def inspect(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
 ) -> None:
     """What a store holds: arrays, stages done, cameras, what is stale."""
-    from flows.inspect_command import inspect_command
+    from flows.commands.inspect import inspect_command
 
     inspect_command(store, verify, as_json)
 
@@ -122,7 +122,7 @@ def export(
     ] = None,
 ) -> None:
     """A finished run as a mesh (PLY, GLB), points, a nerfstudio and COLMAP data set, or renders along any path."""
-    from flows.export_command import SurfaceSettings, export_command
+    from flows.commands.export import SurfaceSettings, export_command
 
     settings = SurfaceSettings(resolution, radius, opacity, views, scale)
     export_command(store, run_name, what, out, frame, settings, path)
@@ -135,7 +135,7 @@ def models(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
 ) -> None:
     """The diffusion models that are installed, and what the network's sizes amount to."""
-    from flows.models_command import models_command
+    from flows.commands.models import models_command
 
     models_command(describe, model, as_json)
 
@@ -147,7 +147,7 @@ def sweep(
     list_: Annotated[bool, typer.Option("--list", help="List the shipped sweeps.")] = False,
 ) -> None:
     """Benchmark sweep: scenes x training views x methods x seeds. Run again, it fills in what is missing."""
-    from flows.sweep_command import sweep_command
+    from flows.commands.sweep import sweep_command
 
     raise typer.Exit(sweep_command(config, out, list_))
 
@@ -166,7 +166,7 @@ def reprocess(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what is stale, why, and what it costs.")] = False,
 ) -> None:
     """Redo what is stale after a change of images, cameras, splits, settings, code or model; nothing else."""
-    from flows.reprocess import reprocess_command
+    from flows.commands.reprocess import reprocess_command
     from schemas.settings import settings_document
 
     problems = reprocess_command(out, split, from_, where or [], settings_document(set_ or []), dry_run)
@@ -183,7 +183,7 @@ def results(
     bound_rest: Annotated[float, typer.Option(help="Loss of SSIM or LPIPS that counts as a regression.")] = 0.01,
 ) -> None:
     """Print an output folder's numbers and compare them with another's."""
-    from flows.results import results_command
+    from flows.commands.results import results_command
 
     raise typer.Exit(1 if results_command(out, against, bound, bound_rest) else 0)
 
@@ -207,7 +207,7 @@ def train(
     ] = None,
 ) -> None:
     """Train a multi-view diffusion model on procedural scenes; run again, it goes on where it was stopped."""
-    from flows.train_command import train_command
+    from flows.commands.train import train_command
 
     path = str(autoencoder) if autoencoder else None
     given: dict[str, Any] = {"steps": steps, "minutes": minutes, "seed": seed, "device": device}
@@ -223,7 +223,7 @@ def stress(
     seed: Annotated[int, typer.Option(help="Another seed searches elsewhere.")] = 0,
 ) -> None:
     """Search the worst relative error of every numerical routine; exit code 1 when a bound is broken."""
-    from flows.stress_command import stress_command
+    from flows.commands.stress import stress_command
 
     stress_command(quick, as_json, only, seed)
 
@@ -239,7 +239,7 @@ def bench(
     ] = None,
 ) -> None:
     """Run time against error for every stage: tables, fronts, and where the defaults stand on them."""
-    from flows.bench_command import bench_command
+    from flows.commands.bench import bench_command
 
     raise typer.Exit(1 if bench_command(name, quick, data, out) else 0)
 
@@ -254,7 +254,9 @@ def main() -> None:
 
     try:
         app()
-    except SystemExit as stop:  # typer makes 130 of Ctrl-C, flows/server.py 143 of SIGTERM, both without a word
+    except (
+        SystemExit
+    ) as stop:  # typer makes 130 of Ctrl-C, flows/pipeline/server.py 143 of SIGTERM, both without a word
         if stop.code in (130, 143):
             print("Interrupted. What is stored stays; run the same command again to go on.", file=sys.stderr)
         raise

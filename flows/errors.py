@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from flows.readers.base import InputError
-from flows.server import ServerError
 from schemas.errors import ConfigError, StoreError
+
+
+class InputError(ValueError):
+    """Something the user gave cannot be used; the message names the file or view and says what to do."""
+
+
+class ServerError(RuntimeError):
+    """The Prefect server could not be started or reached."""
 
 
 class WorkerError(RuntimeError):
@@ -13,7 +19,7 @@ class WorkerError(RuntimeError):
 
 def describe(error: BaseException) -> str | None:
     """The sentence a user sees, or None for a fault of ours, which deserves its traceback."""
-    from cat3d_core.nerf import NonFiniteError
+    from cat3d_core.zipnerf import NonFiniteError
 
     if isinstance(error, (InputError, StoreError, ConfigError, ServerError, NonFiniteError, WorkerError)):
         return str(error)

@@ -11,7 +11,16 @@ from torch import Tensor
 from cat3d_core.cameras import Cameras
 from cat3d_core.cpu_library import library, pointer
 from cat3d_core.splats.reference import (
-    BLUR, LEAST_ALPHA, LEAST_LIGHT, LEAST_RATIO, MOST_ALPHA, NEAR, Raster, Window, slopes, whole,
+    BLUR,
+    LEAST_ALPHA,
+    LEAST_LIGHT,
+    LEAST_RATIO,
+    MOST_ALPHA,
+    NEAR,
+    Raster,
+    Window,
+    slopes,
+    whole,
 )  # fmt: skip
 
 SOURCE = "splats/splats"
@@ -70,9 +79,7 @@ class _Rasterize(torch.autograd.Function):
             pointer(out), pointer(light), pointer(last), pointer(median), threads,
         ):  # fmt: skip
             raise ValueError(f"The CPU rasteriser has {CHANNELS} features, not {channels}.")
-        ctx.save_for_backward(
-            *shape, features, camera, images, tiles, order, begins, gaussian, place, light, last
-        )
+        ctx.save_for_backward(*shape, features, camera, images, tiles, order, begins, gaussian, place, light, last)
         ctx.window, ctx.shown = window, shown
         ctx.mark_non_differentiable(median)
         return out, light, median
@@ -108,7 +115,9 @@ def rasterize(
     shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, features.shape[-1]))
     if any(value.shape != shape for value, shape in zip(tensors, shapes, strict=True)):
         found = [tuple(value.shape) for value in tensors]
-        raise ValueError(f"Expected means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), features; {found}.")
+        raise ValueError(
+            f"Expected means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), features; {found}."
+        )
     if means.dtype not in (torch.float32, torch.float64) or any(
         value.dtype != means.dtype or value.device.type != "cpu" for value in tensors
     ):

@@ -95,7 +95,9 @@ def project(
     zero = torch.zeros_like(x)
     fx, skew, fy = k[0, 0].expand_as(x), k[0, 1].expand_as(x), k[1, 1].expand_as(x)
     jacobian = torch.stack([fx, skew, -(fx * x + skew * y), zero, fy, -fy * y], -1).view(-1, 2, 3) / safe[:, None, None]
-    factor = jacobian @ pose[:3, :3] @ rotation_matrices(quaternions) * scales[:, None, :]  # covariance = factor factor^T
+    factor = (
+        jacobian @ pose[:3, :3] @ rotation_matrices(quaternions) * scales[:, None, :]
+    )  # covariance = factor factor^T
     xx, yy = factor.square().sum(-1).unbind(-1)
     xy = (factor[:, 0] * factor[:, 1]).sum(-1)
     # The determinant as a sum of squares (Cauchy-Binet): nothing cancels, however thin the image is.
@@ -119,9 +121,7 @@ def rasterize(
     antialias: bool = True,
 ) -> Raster:
     """The images of N Gaussians with features (N, C), put over one another, nearest first, over nothing (0)."""
-    raster, _ = rasterize_with_margin(
-        means, quaternions, scales, opacities, features, camera, window, antialias
-    )
+    raster, _ = rasterize_with_margin(means, quaternions, scales, opacities, features, camera, window, antialias)
     return raster
 
 

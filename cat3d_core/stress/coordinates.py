@@ -8,9 +8,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from cat3d_core.nerf import coordinates
 from cat3d_core.stress.draw import Draw
 from cat3d_core.stress.routine import DOUBLE, ROUNDING, SINGLE, Exact, Routine
+from cat3d_core.zipnerf import coordinates
 
 
 def _points(draw: Draw) -> tuple[Tensor, ...]:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cat3d_core.nerf import stepfun
-from cat3d_core.nerf.frustums import (
+from cat3d_core.rays import Rays
+from cat3d_core.stress.draw import Draw
+from cat3d_core.stress.routine import DOUBLE, ROUNDING, SINGLE, Exact, Routine, zero
+from cat3d_core.zipnerf import stepfun
+from cat3d_core.zipnerf.frustums import (
     cone_samples,
     grid_samples,
     grid_samples_reference,
     perpendicular_basis,
     sample_distances,
 )
-from cat3d_core.rays import Rays
-from cat3d_core.stress.draw import Draw
-from cat3d_core.stress.routine import DOUBLE, ROUNDING, SINGLE, Exact, Routine, zero
 
 _BINS = 12
 

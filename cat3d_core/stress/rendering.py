@@ -8,12 +8,12 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from cat3d_core.nerf.field import encode_directions, safe_exp
-from cat3d_core.nerf.hash_grid import PRIMES, GridLayout, level_weights, make_layout, query, query_reference
-from cat3d_core.nerf.render import Round, expected_depth, normals_from_depth, weights_from_density
 from cat3d_core.rays import Rays
 from cat3d_core.stress.draw import Draw
 from cat3d_core.stress.routine import ROUNDING, SINGLE, Call, Exact, Reference, Routine, each, zero
+from cat3d_core.zipnerf.field import encode_directions, safe_exp
+from cat3d_core.zipnerf.hash_grid import PRIMES, GridLayout, level_weights, make_layout, query, query_reference
+from cat3d_core.zipnerf.render import Round, expected_depth, normals_from_depth, weights_from_density
 
 _BINS = 10
 Query = Callable[[Tensor, Tensor, Tensor, GridLayout], tuple[Tensor, Tensor]]

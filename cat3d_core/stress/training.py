@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cat3d_core.nerf import losses
-from cat3d_core.nerf.adam import Adam
-from cat3d_core.nerf.config import ReconstructConfig
-from cat3d_core.nerf.render import Round
 from cat3d_core.stress.draw import Draw
 from cat3d_core.stress.routine import SINGLE, Exact, Routine, each
+from cat3d_core.zipnerf import losses
+from cat3d_core.zipnerf.adam import Adam
+from cat3d_core.zipnerf.config import ReconstructConfig
+from cat3d_core.zipnerf.render import Round
 
 _EPS = 1e-3
 _CONFIG = ReconstructConfig()

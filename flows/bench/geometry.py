@@ -17,14 +17,14 @@ from torch import Tensor
 
 from cat3d_core.metrics.depth import depth_errors
 from cat3d_core.metrics.geometry import chamfer_distance
-from cat3d_core.nerf import PRESETS, Field, ReconstructConfig, Trainer, Views, render_image, surface_depth
 from cat3d_core.normalization import normalize_scene
 from cat3d_core.random import generator
 from cat3d_core.synthetic import random_cameras, random_scene, trace
 from cat3d_core.synthetic.dataset import surface_points
+from cat3d_core.zipnerf import PRESETS, Field, ReconstructConfig, Trainer, Views, render_image, surface_depth
 from flows.bench.reconstruct import procedural_views
+from flows.errors import InputError
 from flows.exports.mesh import Mesh, fuse, without_crumbs
-from flows.readers.base import InputError
 
 RADIUS = 3.0
 SAMPLES = 20_000

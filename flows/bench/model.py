@@ -33,8 +33,9 @@ from cat3d_core.sample_sets import sample_cameras, source_boxes
 from cat3d_core.synthetic import FAMILIES, random_cameras, random_scene, trace
 from cat3d_core.synthetic.dataset import surface_points
 from cat3d_core.synthetic.tracer import Traced
-from flows.images import read_image, square_image, write_png
-from flows.readers.base import InputError, read_capture
+from flows.errors import InputError
+from flows.media.images import read_image, square_image, write_png
+from flows.readers.base import read_capture
 
 CAPTURED = ("llff_fern", "dtu_scan24", "co3d_apple", "re10k_bedroom", "mipnerf360_bonsai", "fox")
 ALL_CAPTURED = "all captured"

@@ -18,9 +18,9 @@ from typing import Any
 import torch
 
 from cat3d_core.alignment import pose_errors
-from flows.poses import PoseError, PoseSettings, estimate_poses
 from flows.readers import read_capture
 from flows.readers.splits import linspace_ids
+from flows.sfm.poses import PoseError, PoseSettings, estimate_poses
 
 # Scene: how many of its views, evenly spread.
 SCENES = {"llff_fern": 20, "llff_flower": 17, "strecha_fountain_P11": 11, "fox": 17, "dtu_scan24": 25, "co3d_apple": 20}

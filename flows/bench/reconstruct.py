@@ -14,10 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cat3d_core.nerf import PRESETS, ReconstructConfig, Trainer, Views, hash_grid_cpu, hash_grid_triton, render_image
-from cat3d_core.nerf.hash_grid import GridLayout, make_layout, query_reference
 from cat3d_core.normalization import normalize_scene
 from cat3d_core.synthetic import random_cameras, random_scene, trace
+from cat3d_core.zipnerf import PRESETS, ReconstructConfig, Trainer, Views, hash_grid_cpu, hash_grid_triton, render_image
+from cat3d_core.zipnerf.hash_grid import GridLayout, make_layout, query_reference
 from flows.progress import meter
 
 Times = tuple[float, float]  # wall and processor seconds

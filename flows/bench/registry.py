@@ -18,13 +18,13 @@ import torch
 from cat3d_core.diffusion import GuidanceConfig, SamplerConfig, load_model
 from cat3d_core.diffusion.checkpoint import describe
 from cat3d_core.metrics.perceptual import find_perceptual
-from cat3d_core.nerf import PRESETS
 from cat3d_core.weights import default_model_path
+from cat3d_core.zipnerf import PRESETS
 from flows.bench import metrics, model, plan, poses, reconstruct, sampler, scenes, skips, store, synthetic
-from flows.images import read_image
+from flows.errors import InputError
+from flows.generation.model import GUIDANCE_INTERVAL, SAMPLER_DEFAULT
+from flows.media.images import read_image
 from flows.readers import read_capture
-from flows.readers.base import InputError
-from flows.sampling.model import GUIDANCE_INTERVAL, SAMPLER_DEFAULT
 from schemas.config import PosesConfig, ReconstructConfig, SampleConfig
 
 Row = dict[str, Any]

@@ -17,14 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from flows.jobs import Job, expected_steps, make_jobs, pending
-from flows.run_command import make_config
-from flows.sampling.executors import open_executor
-from flows.sampling.fan_out import fan_out
-from flows.sampling.work import Batch, is_done
-from flows.scene import ensure_store, execute_stage, prepare_run
-from flows.server import prefect_server
+from flows.commands.run import make_config
+from flows.pipeline.jobs import Job, expected_steps, make_jobs, pending
+from flows.pipeline.scene import ensure_store, execute_stage, prepare_run
+from flows.pipeline.server import prefect_server
 from flows.stages.sample import sample_work
+from flows.workers.executors import open_executor
+from flows.workers.fan_out import fan_out
+from flows.workers.work import Batch, is_done
 from schemas.scene_store import SceneStore
 
 SOURCE = "procedural:dtu/3?views=9&width=64&height=64"

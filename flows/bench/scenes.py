@@ -10,10 +10,10 @@ import torch
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.metrics.protocols import evaluate
-from cat3d_core.nerf import ReconstructConfig, Trainer, Views, render_image
 from cat3d_core.normalization import normalize_scene
+from cat3d_core.zipnerf import ReconstructConfig, Trainer, Views, render_image
+from flows.errors import InputError
 from flows.readers import read_capture
-from flows.readers.base import InputError
 from flows.stages.ingest import ingest_view
 from schemas.config import IngestConfig
 

@@ -17,14 +17,14 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
-from flows.jobs import Job, Step, expected_steps, make_jobs, pending
-from flows.locks import writing
+from flows.commands.run import make_config
+from flows.pipeline.jobs import Job, Step, expected_steps, make_jobs, pending
+from flows.pipeline.locks import writing
+from flows.pipeline.scene import ensure_store, execute_stage, prepare_run
 from flows.readers import read_capture
-from flows.report import write_report
-from flows.run_command import make_config
-from flows.scene import ensure_store, execute_stage, prepare_run
+from flows.reporting.report import write_report
+from flows.reporting.summary import number, summary_rows
 from flows.stages.reconstruct import Checkpoint
-from flows.summary import number, summary_rows
 from schemas.layout import LAYOUT, SCENE_STAGES
 from schemas.scene_store import SceneStore
 from schemas.skip import SkipConfig
@@ -69,7 +69,7 @@ def sources(data: Path | None, real: Sequence[str] = REAL) -> Iterator[tuple[str
 
 def longer_side(scene: Path) -> int:
     """Of the first view, in pixels."""
-    from flows.images import image_size
+    from flows.media.images import image_size
 
     return max(image_size(read_capture(scene).paths[0]))
 

@@ -9,9 +9,9 @@ import numpy as np
 import pycolmap
 
 from cat3d_core.cameras import Cameras
+from flows.errors import InputError
 from flows.exports.ply import write_bytes, write_ply
-from flows.images import write_png
-from flows.readers.base import InputError
+from flows.media.images import write_png
 from flows.readers.parsing import from_opengl
 
 

@@ -16,8 +16,8 @@ import torch
 from cat3d_core.cameras import Cameras
 from cat3d_core.normalization import Similarity
 from cat3d_core.rays import image_rays
+from flows.errors import InputError
 from flows.exports.ply import write_bytes, write_ply
-from flows.readers.base import InputError
 
 BLOCK = 8  # voxels per block side
 TRUNCATION = 5.0  # voxels, as zipnerf-pytorch's tsdf.py

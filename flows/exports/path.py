@@ -11,12 +11,12 @@ import numpy as np
 import torch
 
 from cat3d_core.cameras import Cameras
+from flows.errors import InputError
 from flows.exports.source import Source, render_views
-from flows.images import read_image, write_png
-from flows.pictures import depth_picture
-from flows.readers.base import InputError
+from flows.media.images import read_image, write_png
+from flows.media.pictures import depth_picture
+from flows.media.video import write_video
 from flows.readers.parsing import load_json, numbers
-from flows.video import write_video
 
 LARGEST_SIDE = 8192
 

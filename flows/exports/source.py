@@ -10,10 +10,10 @@ from typing import Any
 import torch
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.nerf import Field, ReconstructConfig, Render, render_image
 from cat3d_core.normalization import Similarity
+from cat3d_core.zipnerf import Field, ReconstructConfig, Render, render_image
+from flows.errors import InputError
 from flows.progress import meter
-from flows.readers.base import InputError
 from flows.stages.common import read_cameras, read_images, read_similarity, views_with_role
 from flows.stages.training_views import generated_views
 from schemas.scene_store import Run, SceneStore

@@ -1,5 +1,5 @@
 """Dataset readers: every layout becomes one `Capture` (see `base`)."""
 
-from flows.readers.base import READERS, Capture, InputError, read_capture
+from flows.readers.base import READERS, Capture, read_capture
 
-__all__ = ["READERS", "Capture", "InputError", "read_capture"]
+__all__ = ["READERS", "Capture", "read_capture"]

@@ -18,6 +18,7 @@ import numpy as np
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
+from flows.errors import InputError
 
 # In the order in which detection tries them: the more specific layout first.
 READERS = (
@@ -33,10 +34,6 @@ READERS = (
     "photos",
 )
 VIEW_COUNTS = (1, 3, 6, 9)
-
-
-class InputError(ValueError):
-    """Something the user gave cannot be used; the message names the file or view and says what to do."""
 
 
 @dataclass

@@ -8,10 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from flows.colmap import pycolmap
+from flows.errors import InputError
 from flows.readers import splits
-from flows.readers.base import Capture, InputError, inside
+from flows.readers.base import Capture, inside
 from flows.readers.parsing import cameras_for_files, family_of, from_camera_from_world, pinhole, unlisted_note
+from flows.sfm.colmap import pycolmap
 
 LOOKS_FOR = "sparse/0, sparse, or colmap/sparse/0 with cameras.bin or cameras.txt (COLMAP)"
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")

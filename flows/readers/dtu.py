@@ -11,9 +11,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from flows.images import image_size, list_images
+from flows.errors import InputError
+from flows.media.images import image_size, list_images
 from flows.readers import splits
-from flows.readers.base import Capture, InputError
+from flows.readers.base import Capture
 from flows.readers.parsing import cameras_for_files, from_camera_from_world, images_in, load_arrays, numbers
 
 LOOKS_FOR = "cameras_sphere.npz or cameras.npz beside image/ (DTU, IDR/NeuS)"

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from flows.errors import InputError
 from flows.readers import splits
-from flows.readers.base import Capture, InputError
+from flows.readers.base import Capture
 from flows.readers.parsing import cameras_for_files, images_in, pinhole
 
 LOOKS_FOR = "poses_bounds.npy (LLFF)"

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras, orthonormalize
-from flows.images import image_size, list_images
-from flows.readers.base import InputError
+from flows.errors import InputError
+from flows.media.images import image_size, list_images
 
 # Image and calibration may differ in aspect by rounding (3118 x 2078 -> 800 x 533), not by a crop or a turn.
 ASPECT_TOLERANCE = 0.02

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flows.images import image_size, list_images
+from flows.errors import InputError
+from flows.media.images import image_size, list_images
 from flows.readers import splits
-from flows.readers.base import Capture, InputError
+from flows.readers.base import Capture
 from flows.readers.parsing import images_in
 
 LOOKS_FOR = "a folder with image files (or images/ with image files), or one image file"

@@ -16,9 +16,10 @@ import numpy as np
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.synthetic import Scene, random_cameras, random_scene, trace
-from flows.images import to_uint8
+from flows.errors import InputError
+from flows.media.images import to_uint8
 from flows.readers import splits
-from flows.readers.base import Capture, InputError
+from flows.readers.base import Capture
 from schemas.content_key import content_key
 
 #: Raise when a spec renders otherwise than before: its images are known by the spec and this, not by their pixels.

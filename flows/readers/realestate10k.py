@@ -11,9 +11,10 @@ from pathlib import Path
 
 import torch
 
-from flows.images import image_size, list_images
+from flows.errors import InputError
+from flows.media.images import image_size, list_images
 from flows.readers import splits
-from flows.readers.base import Capture, InputError
+from flows.readers.base import Capture
 from flows.readers.parsing import cameras_for_files, from_camera_from_world, images_in, unlisted_note
 
 LOOKS_FOR = "a clip's .txt of 19 numbers a line below a video address, with frames named by timestamp (RealEstate10K)"

@@ -9,8 +9,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from flows.errors import InputError
 from flows.readers import splits
-from flows.readers.base import Capture, InputError
+from flows.readers.base import Capture
 from flows.readers.parsing import load_json, unlisted_note
 from flows.readers.transforms import load_frames, to_capture
 

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import torch
 
+from flows.errors import InputError
 from flows.readers import splits
-from flows.readers.base import Capture, InputError
+from flows.readers.base import Capture
 from flows.readers.parsing import cameras_for_files, images_in, numbers, read_text_table, unlisted_note
 
 LOOKS_FOR = "*.camera files, one per image (Strecha)"

@@ -15,9 +15,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from flows.images import EXTENSIONS, image_size
+from flows.errors import InputError
+from flows.media.images import EXTENSIONS, image_size
 from flows.readers import splits
-from flows.readers.base import Capture, InputError, inside
+from flows.readers.base import Capture, inside
 from flows.readers.parsing import (
     cameras_for_files,
     family_of,

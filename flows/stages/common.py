@@ -9,7 +9,7 @@ import torch
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.normalization import Similarity
-from flows.readers.base import InputError
+from flows.errors import InputError
 from schemas.layout import ROLES
 from schemas.scene_store import Run, SceneStore, Section
 

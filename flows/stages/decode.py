@@ -9,12 +9,12 @@ import numpy as np
 import torch
 
 from cat3d_core.diffusion import MultiViewModel
-from flows.images import to_uint8
-from flows.jobs import Job, Outcome
-from flows.sampling.fan_out import fan_out
-from flows.sampling.groups import view_keys
-from flows.sampling.model import model_config, model_hash, shared_model
-from flows.sampling.work import Work, is_done
+from flows.generation.groups import view_keys
+from flows.generation.model import model_config, model_hash, shared_model
+from flows.media.images import to_uint8
+from flows.pipeline.jobs import Job, Outcome
+from flows.workers.fan_out import fan_out
+from flows.workers.work import Work, is_done
 from schemas.scene_store import SceneStore, Section
 
 VERSION = 1

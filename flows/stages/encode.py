@@ -8,11 +8,11 @@ import numpy as np
 import torch
 
 from cat3d_core.sample_sets import KINDS, source_boxes
-from flows.images import square_image
-from flows.jobs import Job, Outcome
+from flows.generation.groups import CAPTURED_LATENTS
+from flows.generation.model import cpu_threads, device, encoder_hash, forget_model, model_config, shared_model
+from flows.media.images import square_image
+from flows.pipeline.jobs import Job, Outcome
 from flows.progress import Meter, meter
-from flows.sampling.groups import CAPTURED_LATENTS
-from flows.sampling.model import cpu_threads, device, encoder_hash, forget_model, model_config, shared_model
 from schemas.content_key import content_key
 from schemas.scene_store import SceneStore
 

@@ -16,7 +16,7 @@ from cat3d_core.metrics.geometry import chamfer_distance
 from cat3d_core.metrics.perceptual import PerceptualDistance, find_perceptual, perceptual_name
 from cat3d_core.metrics.protocols import PROTOCOLS, evaluate
 from cat3d_core.synthetic.dataset import surface_points
-from flows.jobs import Job, Outcome
+from flows.pipeline.jobs import Job, Outcome
 from flows.progress import meter
 from flows.stages.common import read_cameras, read_similarity, views_with_role
 from schemas.errors import ConfigError

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
-from flows import images
-from flows.jobs import Job, Outcome, capture_digests
+from flows.errors import InputError
+from flows.media import images
+from flows.pipeline.jobs import Job, Outcome, capture_digests
 from flows.progress import meter
-from flows.readers.base import Capture, InputError
+from flows.readers.base import Capture
 from schemas.config import IngestConfig
 from schemas.scene_store import SceneStore
 

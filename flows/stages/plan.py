@@ -10,8 +10,8 @@ import torch
 from cat3d_core.cameras import Cameras
 from cat3d_core.plan import Plan, PlanConfig, make_plan
 from cat3d_core.sample_sets import KINDS
-from flows.jobs import Job, Outcome
-from flows.sampling.model import model_config
+from flows.generation.model import model_config
+from flows.pipeline.jobs import Job, Outcome
 from flows.stages.common import read_cameras, views_with_role, write_cameras
 from schemas.errors import ConfigError
 from schemas.scene_store import Run, SceneStore
@@ -37,7 +37,9 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     run = store.run(job.run)
     plan, train = plan_run(job, store, run)
     write_plan(run, plan, train, store.captured.shape("size")[0])
-    from flows.plan_drawing import draw_plan  # matplotlib: a second, which asking what is to do should not cost
+    from flows.reporting.plan_drawing import (
+        draw_plan,  # matplotlib: a second, which asking what is to do should not cost
+    )
 
     job.pictures.mkdir(parents=True, exist_ok=True)
     picture = draw_plan(read_cameras(store.captured, train), plan, _points(store), f"{job.scene_id} {job.run}")

@@ -10,11 +10,11 @@ import torch
 
 from cat3d_core.cameras import Cameras, orthonormalize
 from cat3d_core.normalization import Similarity, normalize_scene
-from flows import images
-from flows.jobs import Job, Outcome
-from flows.poses import PoseSettings, estimate_poses
+from flows.media import images
+from flows.pipeline.jobs import Job, Outcome
 from flows.progress import Meter, meter
 from flows.readers.base import Capture
+from flows.sfm.poses import PoseSettings, estimate_poses
 from flows.stages.common import write_cameras
 from flows.stages.ingest import ingest_view, write_captured
 from schemas.scene_store import SceneStore

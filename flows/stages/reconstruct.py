@@ -12,8 +12,8 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from cat3d_core.metrics.perceptual import find_perceptual, perceptual_name
-from cat3d_core.nerf import PRESETS, Field, ReconstructConfig, Trainer, Views
-from flows.jobs import Job, Outcome
+from cat3d_core.zipnerf import PRESETS, Field, ReconstructConfig, Trainer, Views
+from flows.pipeline.jobs import Job, Outcome
 from flows.progress import meter
 from flows.stages.training_views import training_views
 from schemas.errors import ConfigError

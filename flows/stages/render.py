@@ -6,15 +6,15 @@ import numpy as np
 import torch
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.nerf import Field, render_image
 from cat3d_core.trajectories import RECIPES, Shift, choose_recipe, scene_frame
-from flows import images
-from flows.jobs import Job, Outcome
-from flows.pictures import depth_picture
+from cat3d_core.zipnerf import Field, render_image
+from flows.media import images
+from flows.media.pictures import depth_picture
+from flows.media.video import write_video
+from flows.pipeline.jobs import Job, Outcome
 from flows.progress import Meter, meter
 from flows.stages.common import read_cameras, views_with_role, write_cameras
 from flows.stages.reconstruct import read_field
-from flows.video import write_video
 from schemas.content_key import array_digest, content_key
 from schemas.scene_store import Run, SceneStore, Section
 

@@ -11,13 +11,13 @@ import torch
 
 from cat3d_core.diffusion import SamplerConfig, Schedule, count_flops
 from cat3d_core.diffusion.sampler import evaluations
-from flows.jobs import Job, Outcome
-from flows.sampling.fan_out import Totals, fan_out
-from flows.sampling.groups import Group, StoredPlan, view_keys
-from flows.sampling.model import model_config, model_hash, sampler_config, sampler_settings, shared_model
-from flows.sampling.rounds import OneRound, Rounds
-from flows.sampling.shrinking import sample_at_most
-from flows.sampling.work import Work, is_done
+from flows.generation.groups import Group, StoredPlan, view_keys
+from flows.generation.model import model_config, model_hash, sampler_config, sampler_settings, shared_model
+from flows.generation.rounds import OneRound, Rounds
+from flows.generation.shrinking import sample_at_most
+from flows.pipeline.jobs import Job, Outcome
+from flows.workers.fan_out import Totals, fan_out
+from flows.workers.work import Work, is_done
 from schemas.scene_store import SceneStore
 
 VERSION = 1

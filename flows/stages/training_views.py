@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.nerf import Views
-from flows.brief import LEAST, shown_by_captured
-from flows.images import resize
-from flows.jobs import Job
+from cat3d_core.zipnerf import Views
+from flows.generation.brief import LEAST, shown_by_captured
+from flows.media.images import resize
+from flows.pipeline.jobs import Job
 from flows.stages.common import read_cameras, read_images, views_with_role
 from schemas.scene_store import Run, SceneStore
 

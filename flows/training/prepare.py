@@ -12,9 +12,9 @@ import torch
 
 from cat3d_core.diffusion import Autoencoder, LatentBank, ModelConfig, load_model
 from cat3d_core.weights import default_model_path
-from flows.images import read_image
+from flows.errors import InputError
+from flows.media.images import read_image
 from flows.progress import console, meter
-from flows.readers.base import InputError
 from flows.training import renders
 from flows.training.autoencoder import (
     load_autoencoder,

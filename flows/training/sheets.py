@@ -17,7 +17,7 @@ from cat3d_core.metrics.psnr import psnr
 from cat3d_core.random import normal
 from cat3d_core.rays import raymap
 from flows.bench.model import camera_distance, held_out_group
-from flows.images import write_png
+from flows.media.images import write_png
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 
-from cat3d_core.nerf import PRESETS, Trainer
+from cat3d_core.zipnerf import PRESETS, Trainer
 from flows.bench.reconstruct import kernels, procedural_views, train_and_measure
 
 #: Rays a step, and the seconds that the whole job may take on one H200.

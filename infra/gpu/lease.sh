@@ -69,7 +69,7 @@ join() {
 check() {
   mkdir -p "$1" "$WORK"
   site
-  "$PYTHON" -m pytest -q --noconftest -p no:cacheprovider tests/core/nerf/test_hash_grid_triton.py -k compiled 2>&1 | tee "$1/kernel_test.log"
+  "$PYTHON" -m pytest -q --noconftest -p no:cacheprovider tests/core/zipnerf/test_hash_grid_triton.py -k compiled 2>&1 | tee "$1/kernel_test.log"
   "$PYTHON" infra/gpu/check.py "$1" "${@:2}"
 }
 

@@ -12,10 +12,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from flows.charts import Point, Series, chart, log_ticks, ticks
-from flows.published import PUBLISHED
-from flows.report import write_report
-from flows.summary import paper_tables, summary_rows, timing_rows
+from flows.reporting.charts import Point, Series, chart, log_ticks, ticks
+from flows.reporting.published import PUBLISHED
+from flows.reporting.report import write_report
+from flows.reporting.summary import paper_tables, summary_rows, timing_rows
 from schemas.tables import METRICS, TIMINGS, append_rows
 from tests.flows.conftest import ROOT, SCENE, TINY, command, environment, prefect_url  # noqa: F401
 
@@ -54,7 +54,7 @@ def test_a_real_browser_shows_it(page: Path, tmp_path: Path, chromium: list[str]
     shot = tmp_path / "shot.png"
     call = [*chromium, "--window-size=1000,3000", f"--screenshot={shot}", page.as_uri()]
     subprocess.run(call, check=True, capture_output=True, timeout=240)
-    from flows.images import read_image
+    from flows.media.images import read_image
 
     picture, _ = read_image(shot)
     assert picture.shape == (3000, 1000, 3)

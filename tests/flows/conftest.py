@@ -22,7 +22,7 @@ TINY = [
 @pytest.fixture(scope="session")
 def prefect_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """A running Prefect server in a folder of its own, found by flows in this process and in those it starts."""
-    from flows.server import prefect_server
+    from flows.pipeline.server import prefect_server
 
     with prefect_server(tmp_path_factory.mktemp("prefect")) as url:
         yield url

@@ -18,9 +18,9 @@ import typer
 from cat3d_core import alignment, cameras, splines
 from cat3d_core.diffusion import guidance, schedule, solvers
 from cat3d_core.metrics import psnr, ssim
-from cat3d_core.nerf import adam, coordinates, field, frustums, hash_grid, losses, render, stepfun
 from cat3d_core.stress import ROUTINES, stress
-from flows.stress_command import QUICK_CASES, stress_command
+from cat3d_core.zipnerf import adam, coordinates, field, frustums, hash_grid, losses, render, stepfun
+from flows.commands.stress import QUICK_CASES, stress_command
 
 
 @contextlib.contextmanager

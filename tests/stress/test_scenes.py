@@ -18,12 +18,12 @@ from cat3d_core.diffusion.schedule import Schedule
 from cat3d_core.metrics.perceptual import PerceptualDistance
 from cat3d_core.metrics.psnr import psnr
 from cat3d_core.metrics.ssim import ssim
-from cat3d_core.nerf import PRESETS, Field, Trainer, Views, losses, render_image
-from cat3d_core.nerf.field import safe_exp
-from cat3d_core.nerf.render import Round, expected_depth, render_rays, weights_from_density
 from cat3d_core.normalization import Similarity, normalize_scene
 from cat3d_core.plan import PlanConfig, make_plan
 from cat3d_core.rays import Rays, image_rays, raymap
+from cat3d_core.zipnerf import PRESETS, Field, Trainer, Views, losses, render_image
+from cat3d_core.zipnerf.field import safe_exp
+from cat3d_core.zipnerf.render import Round, expected_depth, render_rays, weights_from_density
 from tests.core.diffusion.models import random_model
 
 F64 = torch.float64

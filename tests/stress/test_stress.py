@@ -17,7 +17,7 @@ from cat3d_core.stress import ROUTINES, Routine, stress
 from cat3d_core.stress.draw import Draw
 from cat3d_core.stress.routine import Exact
 from cat3d_core.stress.search import measure
-from flows.stress_command import QUICK_CASES, stress_command
+from flows.commands.stress import QUICK_CASES, stress_command
 
 
 def _named(name: str) -> Routine:

@@ -208,7 +208,7 @@ def test_unknown_autoencoders_are_refused(tmp_path):
 
 def test_real_foreign_autoencoder_on_photographs(shared_weights, shared_data):
     """TAESD for FLUX.2: 29.3 dB on the fox photographs at 128 pixels (measured elsewhere)."""
-    from flows.images import read_image
+    from flows.media.images import read_image
 
     model = load_taesd(shared_weights / "taef2_encoder.safetensors", shared_weights / "taef2_decoder.safetensors")
     files = sorted((shared_data / "fox").rglob("*.jpg"))[:4]

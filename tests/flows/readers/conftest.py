@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from cat3d_core.cameras import Cameras
-from flows.images import write_png
+from flows.media.images import write_png
 
 WIDTH, HEIGHT = 64, 48
 

@@ -13,7 +13,8 @@ import pycolmap
 import pytest
 import torch
 
-from flows.readers import Capture, InputError, read_capture
+from flows.errors import InputError
+from flows.readers import Capture, read_capture
 from flows.readers.base import inside
 
 CASES = {}

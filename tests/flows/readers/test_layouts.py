@@ -13,7 +13,8 @@ import pycolmap
 import pytest
 import torch
 
-from flows.readers import InputError, read_capture
+from flows.errors import InputError
+from flows.readers import read_capture
 from flows.readers.dtu import decompose_projection
 from flows.readers.splits import every_8th, linspace_ids
 
@@ -261,7 +262,7 @@ def test_procedural_images_match_their_cameras():
 
 
 def test_procedural_views_are_known_without_rendering_them(monkeypatch):
-    from flows.jobs import capture_digests
+    from flows.pipeline.jobs import capture_digests
 
     monkeypatch.setattr("flows.readers.procedural.trace", None)
     one, other = (read_capture(f"procedural:dtu/{seed}?views=4&width=24&height=16") for seed in (51, 52))

@@ -1,7 +1,7 @@
 """The readers' cameras on real photographs: SIFT matches must lie on their epipolar lines.
 
-The images are read, undistorted and resized by `flows.images`, and the cameras changed along, so a wrong axis, a wrong
-scale of K, a half-applied distortion or a wrong resize all show as pixels here.
+The images are read, undistorted and resized by `flows.media.images`, and the cameras changed along, so a wrong axis,
+a wrong scale of K, a half-applied distortion or a wrong resize all show as pixels here.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from cat3d_core.cameras import Cameras
-from flows.images import read_image, resize, undistort
+from flows.media.images import read_image, resize, undistort
 from flows.readers import read_capture
 
 LONG_SIDE = 800

@@ -1,0 +1,136 @@
+"""The radiance field: hash grid features to density, and to colour for the final round (Zip-NeRF)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from cat3d_core.random import generator
+from cat3d_core.zipnerf.config import ReconstructConfig
+from cat3d_core.zipnerf.hash_grid import make_layout, query
+
+_LOG_DENSITY_MAX = 40.0  # e^40 * 1e6 is far below the float32 maximum: optical depths stay finite
+
+
+class _SafeExp(torch.autograd.Function):
+    """exp(min(x, 40)) whose gradient beyond the cap is that at the cap, so that no density gets stuck."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        y = x.clamp_max(_LOG_DENSITY_MAX).exp()
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # type: ignore[override]
+        return gradient * ctx.saved_tensors[0]
+
+
+def safe_exp(x: Tensor) -> Tensor:
+    """exp with value and gradient capped at e^40."""
+    return _SafeExp.apply(x)  # type: ignore[no-any-return]
+
+
+def encode_directions(unit: Tensor, degree: int) -> Tensor:
+    """Positional encoding (..., 3 + 6 degree) of unit directions (..., 3): identity, then sin and cos of 2^k d."""
+    scaled = (unit[..., None, :] * 2.0 ** torch.arange(degree, dtype=unit.dtype, device=unit.device)[:, None]).flatten(
+        -2
+    )
+    return torch.cat([unit, scaled.sin(), scaled.cos()], -1)
+
+
+class GridDensity(nn.Module):
+    """One hash grid and the layers that read it: features of cone samples -> hidden units -> density."""
+
+    def __init__(self, config: ReconstructConfig, round_index: int) -> None:
+        super().__init__()
+        self.gain, self.init, self.bias = config.grid_gain, config.grid_init, config.density_bias
+        self.layout = make_layout(
+            config.grid_base, config.grid_max[round_index], config.grid_log2_table, config.grid_features[round_index]
+        )
+        self.table = nn.Parameter(torch.empty(self.layout.rows, self.layout.features))
+        self.hidden = nn.Linear(self.layout.levels * (self.layout.features + 1), config.density_width)
+        self.density = nn.Linear(config.density_width, 1)
+
+    def level_rows(self) -> list[tuple[int, int]]:
+        return list(zip(self.layout.offsets[:-1], self.layout.offsets[1:], strict=True))
+
+    def forward(self, positions: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
+        """Cone samples (R, N, S, 3), (R, N, S) in the unit cube (`grid_samples`) -> density (R, N) per scene unit,
+        hidden units (R, N, width)."""
+        rays, intervals, samples = std.shape
+        features, weights = query(self.table, positions.reshape(-1, samples, 3), std.reshape(-1, samples), self.layout)
+        # Scale feature (Zip-NeRF sec. 2): tells the network how much of a level was weighted away.
+        with torch.no_grad():
+            norms = [torch.linalg.vector_norm(self.table[a:b]) for a, b in self.level_rows()]
+            counts = [(b - a) * self.layout.features for a, b in self.level_rows()]
+            power = torch.stack(norms).square() / torch.tensor(counts, device=weights.device)
+            scale = (2.0 * weights - 1.0) * (self.init**2 + power).sqrt()
+        inputs = torch.cat([features, scale[..., None]], -1).flatten(1) * self.gain
+        hidden = torch.relu(self.hidden(inputs)).view(rays, intervals, -1)
+        return safe_exp(self.density(hidden)[..., 0] + self.bias), hidden
+
+
+class ViewColour(nn.Module):
+    """Colour of hidden units seen from a direction: bottleneck, directions, a small network, padded sigmoid."""
+
+    def __init__(self, config: ReconstructConfig) -> None:
+        super().__init__()
+        self.degree, self.padding = config.view_degree, config.rgb_padding
+        self.bottleneck = nn.Linear(config.density_width, config.bottleneck_width)
+        inputs = config.bottleneck_width + 3 + 6 * config.view_degree
+        widths = [inputs] + [config.view_width] * config.view_depth
+        self.layers = nn.ModuleList([nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True)])
+        # With more than one layer the input is concatenated again before the last, as in Zip-NeRF.
+        self.skip = config.view_depth > 1
+        self.rgb = nn.Linear(widths[-1] + (inputs if self.skip else 0), 3)
+
+    def forward(self, hidden: Tensor, directions: Tensor) -> Tensor:
+        """hidden (R, N, width), directions (R, 3) -> rgb (R, N, 3) in [0, 1] up to the padding."""
+        unit = directions / directions.norm(dim=-1, keepdim=True)
+        view = encode_directions(unit, self.degree)[:, None].expand(-1, hidden.shape[1], -1)
+        inputs = torch.cat([self.bottleneck(hidden), view], -1)
+        x = inputs
+        for layer in self.layers:
+            x = torch.relu(layer(x))
+        raw = self.rgb(torch.cat([x, inputs], -1) if self.skip else x)
+        return torch.sigmoid(raw) * (1.0 + 2.0 * self.padding) - self.padding
+
+
+class Field(nn.Module):
+    """Proposal densities and the final radiance field of one scene, in normalised scene coordinates."""
+
+    def __init__(self, config: ReconstructConfig, seed: int = 0) -> None:
+        super().__init__()
+        self.config = config
+        self.grids = nn.ModuleList([GridDensity(config, index) for index in range(config.rounds)])
+        self.colour = ViewColour(config)
+        draw = generator(seed, "nerf", "init")
+        with torch.no_grad():
+            for module in self.modules():
+                if isinstance(module, GridDensity):
+                    module.table.uniform_(-config.grid_init, config.grid_init, generator=draw)
+                elif isinstance(module, nn.Linear):  # he_uniform
+                    bound = math.sqrt(6.0 / module.in_features)
+                    module.weight.uniform_(-bound, bound, generator=draw)
+                    module.bias.zero_()
+
+    @classmethod
+    def from_state(cls, config: ReconstructConfig, state: Mapping[str, Tensor]) -> Field:
+        """Field from `Trainer.state()` or its own state dict. Raises ValueError where names or shapes do not fit the
+        config."""
+        own = {
+            name.removeprefix("field."): value
+            for name, value in state.items()
+            if not name.startswith(("adam.", "trainer."))
+        }
+        field = cls(config)
+        try:
+            field.load_state_dict(own)
+        except RuntimeError as error:
+            raise ValueError(f"The stored field does not fit this reconstruction config: {error}") from error
+        return field

@@ -1,0 +1,53 @@
+"""Losses of the reconstruction and the trust in generated views."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from cat3d_core.zipnerf import stepfun
+from cat3d_core.zipnerf.config import ReconstructConfig
+from cat3d_core.zipnerf.coordinates import power_ladder
+from cat3d_core.zipnerf.render import Round
+
+
+def charbonnier(difference: Tensor, eps: float) -> Tensor:
+    """sqrt(d^2 + eps^2), elementwise (Zip-NeRF's data loss)."""
+    return (difference.square() + eps * eps).sqrt()
+
+
+def interlevel(proposals: list[Round], final: Round, blur: tuple[float, ...]) -> Tensor:
+    """Spline inter-level loss (Zip-NeRF sec. 3): sum over proposals of mean(max(0, blurred w - proposal w)^2 /
+    proposal w).
+
+    The final histogram is a constant target; gradients flow to the proposals' weights only. eps keeps the denominator
+    from zero: the slope is below 1 / eps^2 = 7e13 for a missed surface, finite, and falls with the proposal's own
+    weight.
+    """
+    total = torch.zeros((), dtype=final.weights.dtype, device=final.weights.device)
+    for proposal, halfwidth in zip(proposals, blur, strict=False):
+        target = stepfun.blurred_resample(proposal.s, final.s, final.weights.detach(), halfwidth)
+        eps = torch.finfo(target.dtype).eps
+        total = total + ((target - proposal.weights).clamp_min(0.0).square() / (proposal.weights + eps)).mean()
+    return total
+
+
+def distortion(final: Round, config: ReconstructConfig) -> Tensor:
+    """Mean distortion of the final histograms over power-ladder distance (Zip-NeRF supplement)."""
+    t = power_ladder(final.t, config.distortion_power, config.distortion_premult)
+    return stepfun.distortion(t, final.weights).mean()
+
+
+def view_weights(centers: Tensor, captured: Tensor, config: ReconstructConfig, progress: float) -> Tensor:
+    """Loss weight (N,) of each view at `progress` in [0, 1] through training (CAT3D app., 'Distance based weighting').
+
+    Captured views weigh 1; a generated view exp(-b s^2) * g with s the distance of its centre (N, 3, normalised units)
+    to the nearest captured one, b rising linearly from 0 to `distance_falloff`, g falling from 1 to
+    `generated_weight_final`.
+    """
+    if bool(captured.all()) or not bool(captured.any()):
+        return torch.ones(len(centers), device=centers.device)
+    distance = torch.cdist(centers, centers[captured]).amin(1) / config.distance_unit
+    falloff = torch.exp(-progress * config.distance_falloff * distance.square())
+    overall = 1.0 + progress * (config.generated_weight_final - 1.0)
+    return torch.where(captured, 1.0, overall * falloff).to(torch.float32)

@@ -1,0 +1,93 @@
+"""`cat3d run` and `cat3d demo`: make the jobs, see what is missing, run the flow with one server, write the report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from flows.pipeline.jobs import Job, capture_digests, expected_steps, make_jobs, pending
+from flows.progress import console
+from schemas.config import RunConfig, load_config, parse_config
+from schemas.settings import merged, set_at, settings_document, value_at
+
+#: Where each command-line option lives in the configuration.
+OPTION_FIELDS = {
+    "downscale": ("ingest", "downscale"),
+    "method": ("method",),
+    "preset": ("reconstruct", "preset"),
+    "seed": ("seed",),
+    "model": ("sample", "checkpoint"),
+    "trajectory": ("plan", "trajectory"),
+    "count": ("plan", "views"),
+}
+DEMO_SOURCE = "procedural:co3d/4?views=16&width=96&height=96"
+
+
+def run_command(
+    source: str,
+    out: Path,
+    views: Sequence[str],
+    given: dict[str, Any],
+    reader: str = "auto",
+    image_folder: str | None = None,
+    config_file: Path | None = None,
+    settings: Sequence[str] = (),
+) -> list[Job]:
+    """Do everything that is not done yet for one scene and its splits. Raises InputError, ConfigError and others."""
+    started = time.monotonic()
+    config = make_config(given, config_file, settings)
+    with console.status(f"Reading {source}"):
+        capture, jobs = make_jobs(source, out.resolve(), [v.strip() for v in views], config, reader, image_folder)
+        digests = capture_digests(capture)
+        todo = {job.run: pending(job, expected_steps(job, capture, digests)) for job in jobs}
+    console.print(f"{capture.scene_id}: {len(capture)} views ({capture.dataset})")
+    for job in jobs:
+        steps = todo[job.run]
+        if steps:
+            console.print(f"  {job.run}: to do: " + ", ".join(f"{s.stage} ({s.why})" for s in steps))
+        else:
+            console.print(f"  {job.run}: every stage is done already; nothing to do.")
+    if any(todo.values()):
+        from flows.pipeline.server import prefect_server
+
+        with prefect_server(out.resolve() / ".prefect"):
+            from flows.pipeline.scene import scene_flow
+
+            scene_flow(capture.scene_id, [job.model_dump(mode="json") for job in jobs])
+    from flows.reporting.report import write_report
+    from flows.reporting.summary import print_metrics
+
+    report = write_report(out.resolve(), only_if_changed=not any(todo.values()))
+    print_metrics(out.resolve(), capture.scene_id)
+    console.print(f"Report: {report}  ({time.monotonic() - started:.0f} s)")
+    return jobs
+
+
+def demo_command(out: Path, smallest: bool) -> None:
+    """A procedural scene: three views with and without generated ones, and all views, at a size for two cores."""
+    given: dict[str, Any] = {"downscale": 3.0 if smallest else 1.0, "preset": "fast", "seed": 0}
+    iterations = 60 if smallest else 400
+    settings = [
+        f"reconstruct.overrides={{iterations: {iterations}, warmup_iterations: {iterations // 10}}}",
+        f"render.path_views={4 if smallest else 24}",
+        f"plan.views={5 if smallest else 20}",
+    ]
+    from flows.pipeline.server import prefect_server
+
+    # One server for both: Prefect's client keeps its connection to the first one for as long as the process lives.
+    with prefect_server(out.resolve() / ".prefect"):
+        for method, views in (("zipnerf", ["3"] if smallest else ["3", "all"]), ("cat3d", ["3"])):
+            run_command(DEMO_SOURCE, out, views, given | {"method": method}, settings=settings)
+
+
+def make_config(given: dict[str, Any], config_file: Path | None, settings: Sequence[str]) -> RunConfig:
+    """The run's configuration: file, then --set, then options that differ from their defaults."""
+    document = load_config(config_file).model_dump(mode="json") if config_file else {}
+    defaults = RunConfig().model_dump(mode="json")
+    for name, value in given.items():
+        path = OPTION_FIELDS[name]
+        if config_file is None or value != value_at(defaults, path):
+            set_at(document, path, value)
+    return parse_config(merged(document, settings_document(settings)), "the settings")

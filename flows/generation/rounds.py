@@ -1,0 +1,141 @@
+"""Sampling in rounds: some groups, a brief reconstruction, then the groups it knows least about, while that helps.
+
+Where sampling everything costs less than finding that out, everything is sampled. What decides is a captured view held
+out of the brief reconstructions: when another round of generated views no longer lowers its error, the rest of the plan
+is not sampled. So each scene gets as many generated views as it needs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from cat3d_core.cameras import Cameras
+from cat3d_core.rays import Rays, image_rays
+from cat3d_core.uncertainty import ray_entropy, unseen
+from cat3d_core.view_selection import pose_distance
+from cat3d_core.zipnerf import Field, Views, stepfun
+from cat3d_core.zipnerf.render import render_rays
+from flows.generation.brief import brief_field, brief_render
+from flows.generation.groups import StoredPlan
+from flows.generation.model import device, shared_model
+from flows.media.images import resize
+from flows.pipeline.jobs import Job
+from flows.stages.common import read_cameras, read_images, views_with_role
+from flows.stages.decode import decoded
+from schemas.scene_store import SceneStore
+
+#: Share of the plan's groups in a round, and the least gain in PSNR of the held-out view that is worth another one.
+SHARE, GAIN_DB = 0.25, 0.1
+#: A brief reconstruction in floating-point operations of a denoiser that take as long: on a CPU 11 s, in which the
+#: shipped model does 660 GFLOP (64 evaluations, 240 GFLOP, take 4 s). Choosing takes three of them at least.
+BRIEF_FLOPS, BRIEF_FIELDS = 6.6e11, 3
+#: Longer side of the pictures whose rays say what the field knows, in pixels.
+PROBE_SIDE = 16
+
+
+class OneRound:
+    """All groups of the plan at once. kept: numbers of the groups whose views are used. decisions: why."""
+
+    def __init__(self, plan: StoredPlan) -> None:
+        self.passes = plan.passes()
+        self.kept = [g for items in self.passes for g in items]
+        self.decisions = [] if plan.needed else ["Sampled nothing: captured views cover the path."]
+
+    def __iter__(self) -> Iterator[list[list[int]]]:
+        yield self.passes
+
+
+class Rounds(OneRound):
+    """Passes of groups, a round at a time; the next round is chosen from what the store holds when it is asked for."""
+
+    def __init__(self, job: Job, store: SceneStore, plan: StoredPlan, flops: float) -> None:
+        """flops: of sampling all groups."""
+        super().__init__(plan)
+        self.job, self.store, self.plan, self.flops = job, store, plan, flops
+        self.train = views_with_role(store, store.run(job.run), "train")
+
+    def __iter__(self) -> Iterator[list[list[int]]]:
+        if len(self.train) < 2 or not self.passes:
+            if self.passes:
+                self.decisions.append("Sampled in one round: of one captured view none can be held out.")
+            yield self.passes
+            return
+        if (1 - SHARE) * self.flops < BRIEF_FIELDS * BRIEF_FLOPS:
+            self.decisions.append(
+                "Sampled in one round: all groups cost less than the brief reconstructions that choosing takes."
+            )
+            yield self.passes
+            return
+        *anchors, rest = self.passes
+        size = math.ceil(SHARE * len(rest))
+        chosen = [rest[i] for i in np.unique(np.linspace(0, len(rest) - 1, size).round().astype(int))]
+        self.kept, before, number = [], self.held_out_psnr(self.brief_field([])), 0
+        while chosen:
+            yield [*anchors, chosen]
+            number += 1
+            sampled = [*self.kept, *(g for items in anchors for g in items), *chosen]
+            field = self.brief_field(sampled)
+            after = self.held_out_psnr(field)
+            told = f"Round {number}: with {len(chosen)} more groups the held-out captured view went from "
+            told += f"{before:.2f} dB to {after:.2f} dB"
+            if after >= before:
+                self.kept = sampled
+            if after - before < GAIN_DB:
+                used = "" if after >= before else "; its views are not used"
+                self.decisions.append(f"{told}, which is less than {GAIN_DB:g} dB more{used}.")
+                break
+            self.decisions.append(f"{told}.")
+            left = [g for g in rest if g not in self.kept]
+            unknown = {g: self.unknown(field, g) for g in left}
+            chosen = sorted(sorted(left, key=lambda g: (-unknown[g], g))[:size])
+            anchors, before = [], after
+        count = sum(map(len, self.passes))
+        self.decisions.append(f"{len(self.kept)} of {count} groups are used, chosen for this scene in {number} rounds.")
+
+    @property
+    def held_out(self) -> int:
+        """The training view in the middle of the others: the one the field has the best chance to know."""
+        cameras = read_cameras(self.store.captured, self.train)
+        return self.train[int(pose_distance(cameras, cameras, scale=1.0).sum(1).argmin())]
+
+    def views(self, groups: list[int]) -> Views:
+        """Captured training views but the held-out one, and the decoded views of the groups."""
+        shown = [v for v in self.train if v != self.held_out]
+        cameras, images = read_cameras(self.store.captured, shown), read_images(self.store.captured, shown)
+        run = self.store.run(self.job.run)
+        model = shared_model(self.job)
+        windows = run.plan.read("window")
+        for view in (v for g in groups for v in self.plan.groups[g].targets):
+            x0, y0, width, height = windows[view].tolist()
+            image = decoded(model, run.generated, view)[0, y0 : y0 + height, x0 : x0 + width]
+            cameras = Cameras.cat([cameras, self.plan.cameras[view].crop(x0, y0, width, height)])
+            images.append(torch.from_numpy(np.ascontiguousarray(image)))
+        return Views(cameras, images, torch.arange(len(cameras)) < len(shown))
+
+    def brief_field(self, groups: list[int]) -> Field:
+        """Of the captured views but the held-out one and the views of the groups."""
+        return brief_field(self.views(groups), self.job.config.seed, self.job.config.execution.threads)
+
+    def held_out_psnr(self, field: Field) -> float:
+        """PSNR in dB of the held-out captured view, as `brief_render` shows it."""
+        camera = read_cameras(self.store.captured, [self.held_out]).to(dtype=torch.float32)
+        image = brief_render(field, camera, 0).image.cpu()
+        truth = resize(self.store.captured.read_image("image", self.held_out), image.shape[1], image.shape[0])
+        return -10 * math.log10(float((image - torch.from_numpy(truth) / 255).square().mean()) + 1e-10)
+
+    @torch.no_grad()
+    def unknown(self, field: Field, group: int) -> float:
+        """In [0, 1]: how uncertain the field is of the group's middle view, or how much of it no view has seen."""
+        targets = self.plan.groups[group].targets
+        camera = self.plan.cameras[[targets[len(targets) // 2]]].to(dtype=torch.float32)
+        rays = Rays(*(part.to(device()) for part in image_rays(camera, 0, PROBE_SIDE, PROBE_SIDE)))
+        last = render_rays(field, rays).rounds[-1]
+        ends = rays.origins + stepfun.quantile(last.t, last.weights, 0.5)[:, None] * rays.directions
+        known = [v for g in self.kept for v in self.plan.groups[g].targets]
+        cameras = Cameras.cat([read_cameras(self.store.captured, self.train), self.plan.cameras[known]])
+        away = unseen(ends.cpu().double(), cameras).to(last.weights)
+        return float(torch.maximum(ray_entropy(last.weights), away).mean())

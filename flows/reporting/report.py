@@ -1,0 +1,209 @@
+"""The report of an output folder: one self-contained HTML page, and the same tables as Markdown.
+
+Everything comes from what runs left behind (stores, Parquet tables); nothing is computed again.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, select_autoescape
+
+from flows.media.pictures import depth_picture, error_picture
+from flows.reporting.charts import Point, Series, chart
+from flows.reporting.summary import (
+    markdown,
+    method_order,
+    method_times,
+    number,
+    paper_tables,
+    shared_savings,
+    split_order,
+    summary_rows,
+    timing_rows,
+)
+from schemas.layout import STAGES
+from schemas.scene_store import Run, SceneStore
+from schemas.tables import TIMINGS, read_rows
+
+#: Held-out views shown of each run: all of a few, else this many.
+VIEWS_SHOWN = 3
+#: In sentences on work that was not done.
+SKIPPED = re.compile(
+    r"^(Skipped|Sampled nothing|Trained without|Trained on captured|Went on|Images of half|Proposals were trained at|"
+    r"The LPIPS loss was taken|The field was not asked|Started no workers)|"
+    r"left out|need not be|were saved|are used, chosen"
+)
+SWEEP, PROBLEMS = "sweep.json", "problems.json"
+
+
+def write_report(out: Path, only_if_changed: bool = False) -> Path:
+    """Write report.html and report.md of the folder; returns the page. `only_if_changed` keeps a page that exists."""
+    page = out / "report.html"
+    if only_if_changed and page.exists():
+        return page
+    scenes = [scene_section(out, path) for path in sorted(out.glob("*.zarr"))]
+    rows, timings = summary_rows(out), timing_rows(out)
+    tables = paper_tables(rows)
+    sweep = _document(out / SWEEP) or {}
+    environment = Environment(loader=PackageLoader("flows.reporting"), autoescape=select_autoescape(["html", "j2"]))
+    environment.filters["fixed"] = number
+    published = any(e["published"] for t in tables for d in t["datasets"] for e in d["rows"])
+    context = {
+        "title": sweep.get("name", out.name),
+        "note": sweep.get("note", ""),
+        "problems": _document(out / PROBLEMS) or [],
+        "rows": rows,
+        "psnr": {(r["scene_id"], r["run"]): r["psnr_db"] for r in rows},
+        "tables": tables,
+        "published": published,
+        "more": {name: any(r[name] is not None for r in rows) for name in ("clip_score", "depth_abs_rel")},
+        "timings": timings,
+        "longest": max((t["total"] for t in timings), default=0.0),
+        "methods": method_times(timings),
+        "stages": [s for s in STAGES if any(s in t["stages"] for t in timings)],
+        "shared": shared_savings(timings),
+        "skipped": skipped_work(scenes),
+        "curve": quality_against_time(rows),
+        "scenes": scenes,
+        "versions": versions(out, scenes),
+        "sweep": sweep,
+    }
+    page.write_text(environment.get_template("report.html.j2").render(context), encoding="utf-8")
+    (out / "report.md").write_text(markdown(rows, tables), encoding="utf-8")
+    return page
+
+
+def _document(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+
+
+def scene_section(out: Path, path: Path) -> dict[str, Any]:
+    """What the page shows of one scene: pictures of some held-out views per run, decisions, versions."""
+    store = SceneStore.open(path)
+    truths: dict[int, np.ndarray] = {}
+    runs = []
+    for name in sorted(store.runs(), key=_run_order):
+        run = store.run(name)
+        records = {stage: record for stage in STAGES if (record := store.record(stage, name))}
+        folder = out / store.scene_id / name
+        runs.append(
+            {
+                "name": name,
+                "views": view_pictures(store, run, truths) if "render" in records else [],
+                "decisions": {stage: record.decisions for stage, record in records.items() if record.decisions},
+                "codes": {stage: record.code_version for stage, record in records.items()},
+                "model": records["sample"].inputs.get("model", "") if "sample" in records else "",
+                "config": run.attrs.get("job", {}).get("config", {}),
+                "plan": _uri((folder / "plan.png").read_bytes()) if (folder / "plan.png").exists() else None,
+                "video": f"{store.scene_id}/{name}/path.mp4" if (folder / "path.mp4").exists() else None,
+                "curve": training_curve(run),
+            }
+        )
+    return {"id": store.scene_id, "dataset": store.dataset, "runs": runs, "provenance": store.attrs["provenance"]}
+
+
+def _run_order(name: str) -> tuple:
+    split, _, method = name.removeprefix("v").partition("-")
+    return split_order(split), method_order(method)
+
+
+def view_pictures(store: SceneStore, run: Run, truths: dict[int, np.ndarray]) -> list[dict[str, Any]]:
+    """Truth, render, error and depth of up to VIEWS_SHOWN held-out views, as data URIs. truths: photos read so far."""
+    if "test" not in run.section("renders"):
+        return []
+    section = run.renders("test")
+    views = section.read("view")
+    names = store.captured.read("name")
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(VIEWS_SHOWN, len(views))).round().astype(int))
+    out = []
+    for i in chosen.tolist():
+        view = int(views[i])
+        truth = truths.setdefault(view, store.captured.read_image("image", view))
+        image = section.read_image("image", i)
+        out.append(
+            {
+                "name": str(names[view]),
+                "truth": png_uri(truth),
+                "render": png_uri(image),
+                "error": png_uri(error_picture(image, truth)),
+                "depth": png_uri(depth_picture(section.read_image("depth", i))),
+            }
+        )
+    return out
+
+
+def training_curve(run: Run) -> str | None:
+    """Batch PSNR against seconds of training, as an SVG."""
+    if "field" not in run or "record" not in run.field:
+        return None
+    points = [Point(float(seconds), float(psnr)) for _, seconds, _, psnr in run.field.read("record")]
+    return chart([Series("", points)], "seconds of training", "PSNR of the batch (dB)", lines=True)
+
+
+def quality_against_time(rows: Sequence[dict[str, Any]]) -> str | None:
+    """Mean PSNR of every run against its seconds, one colour per method and protocol, as an SVG."""
+    series: dict[str, list[Point]] = defaultdict(list)
+    several = len({r["protocol"] for r in rows}) > 1
+    for r in sorted(rows, key=lambda r: method_order(r["method"])):
+        if r["seconds"] and r["psnr_db"] is not None:
+            name = f"{r['method']} ({r['protocol']})" if several else r["method"]
+            label = f"{r['scene_id']} {r['run']}: {r['psnr_db']:.2f} dB, {r['seconds']:.1f} s"
+            series[name].append(Point(r["seconds"], r["psnr_db"], label))
+    every = [Series(name, points) for name, points in series.items()]
+    return chart(every, "seconds of the run's stages", "PSNR of held-out views (dB)", log_x=True)
+
+
+def skipped_work(scenes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Sentences on skipped work with the number of runs they are true of; those that differ in numbers only are one."""
+    found: dict[tuple[str, str], dict[str, Any]] = {}
+    for scene in scenes:
+        for run in scene["runs"]:
+            for stage, sentences in run["decisions"].items():
+                for sentence in sentences:
+                    if SKIPPED.search(sentence):
+                        kind = (stage, re.sub(r"[\d.,%]+", "#", sentence))
+                        entry = found.setdefault(
+                            kind, {"stage": stage, "sentence": sentence, "runs": 0, "alike": False}
+                        )
+                        entry["runs"] += 1
+                        entry["alike"] |= sentence != entry["sentence"]
+    return list(found.values())
+
+
+def versions(out: Path, scenes: Sequence[dict[str, Any]]) -> dict[str, list[str]]:
+    """What made the results: packages, code versions of the stages, models, machines; several where scenes differ."""
+    found: dict[str, set[str]] = defaultdict(set)
+    for scene in scenes:
+        for name, version in scene["provenance"].items():
+            if name != "source":
+                found[name].add(str(version))
+        for run in scene["runs"]:
+            for stage, version in run["codes"].items():
+                found[f"stage {stage}"].add(str(version))
+            if run["model"]:
+                found["diffusion model"].add(f"sha256 {run['model'][:16]}")
+    for row in read_rows(out / "timings", TIMINGS).to_pylist():
+        found["machine"].add(f"{row['host']} ({row['device']})")
+    return {name: sorted(values) for name, values in found.items()}
+
+
+def png_uri(image: np.ndarray) -> str:
+    """(H, W, 3) uint8 as a data URI."""
+    from PIL import Image
+
+    data = io.BytesIO()
+    Image.fromarray(image).save(data, format="png")
+    return _uri(data.getvalue())
+
+
+def _uri(png: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(png).decode()

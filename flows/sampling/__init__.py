@@ -1,1 +1,0 @@
-"""Generated views: what a group of views needs, and the fan-out of groups over workers."""
