@@ -9,11 +9,7 @@ import math
 import torch
 from torch import Tensor
 
-<<<<<<< HEAD:cat3d_core/nerf/frustums.py
-from cat3d_core.nerf.coordinates import contract, contracted_std
 from cat3d_core.cpu_library import library, pointer
-=======
->>>>>>> main:cat3d_core/zipnerf/frustums.py
 from cat3d_core.rays import Rays
 from cat3d_core.zipnerf.coordinates import contract, contracted_std
 

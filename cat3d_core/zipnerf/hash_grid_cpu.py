@@ -9,12 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-<<<<<<< HEAD:cat3d_core/nerf/hash_grid_cpu.py
 from cat3d_core.cpu_library import library, pointer
-from cat3d_core.nerf.hash_grid import GridLayout
-=======
 from cat3d_core.zipnerf.hash_grid import GridLayout
->>>>>>> main:cat3d_core/zipnerf/hash_grid_cpu.py
 
 
 def available() -> bool:

@@ -5,15 +5,10 @@ import math
 import pytest
 import torch
 
-<<<<<<< HEAD:tests/core/nerf/test_frustums.py
-from cat3d_core.nerf import frustums
 from cat3d_core.cpu_library import library
-from cat3d_core.nerf.frustums import (
-=======
 from cat3d_core.rays import Rays
 from cat3d_core.zipnerf import frustums
 from cat3d_core.zipnerf.frustums import (
->>>>>>> main:tests/core/zipnerf/test_frustums.py
     cone_samples,
     grid_samples,
     grid_samples_reference,
