@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 STDLIB = sys.stdlib_module_names
 ALLOWED = {
-    "cat3d_core": {"torch", "numpy", "safetensors", "triton", "cat3d_core"},  # triton: guarded, GPU kernels only
+    "cat3d_core": {"torch", "numpy", "safetensors", "triton", "gsplat", "cat3d_core"},  # triton, gsplat: guarded, GPU only
     "schemas": {"zarr", "numcodecs", "pyarrow", "pydantic", "yaml", "numpy", "schemas"},
 }
 

@@ -1,8 +1,8 @@
 """Projection and rasterisation of Gaussians in plain torch: every formula in one place, any dtype, differentiable.
 
-Elliptical weighted averages (Zwicker et al. 2001) as in 3D Gaussian splatting (Kerbl et al. 2023): a Gaussian's image is
-the Gaussian of its covariance under the projection linearised at its mean; images are put over one another in the order
-of the means' z-depth. `splats.cpp` computes the same; this file takes memory for every pixel times every Gaussian.
+Elliptical weighted averages (Zwicker et al. 2001) as in 3D Gaussian splatting (Kerbl et al. 2023): the image of a
+Gaussian is that of its covariance under the projection linearised at its mean; images are put over one another in the
+order of the means' z-depth. `splats.cpp` computes the same; this file takes memory for every pixel times every Gaussian.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def project(
     jacobian = torch.stack([fx, skew, -(fx * x + skew * y), zero, fy, -fy * y], -1).view(-1, 2, 3) / safe[:, None, None]
     factor = (
         jacobian @ pose[:3, :3] @ rotation_matrices(quaternions) * scales[:, None, :]
-    )  # covariance = factor factor^T
+    )
     xx, yy = factor.square().sum(-1).unbind(-1)
     xy = (factor[:, 0] * factor[:, 1]).sum(-1)
     # The determinant as a sum of squares (Cauchy-Binet): nothing cancels, however thin the image is.
