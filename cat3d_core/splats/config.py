@@ -20,7 +20,7 @@ class SplatConfig:
     views_per_step: int = 1
     lr_means: float = 0.01
     lr_means_final: float = 0.0005
-    """Means are moved in contracted coordinates (mip-NeRF 360 eq. 10), so that what is far moves as fast in an image."""
+    """Means are moved in contracted coordinates (mip-NeRF 360 eq. 10): what is far moves as fast in an image."""
     lr_log_scales: float = 0.02
     lr_quaternions: float = 0.01
     lr_logits: float = 0.05
@@ -99,13 +99,14 @@ PRESETS: dict[str, SplatConfig] = {
     "balanced": replace(_FAST, iterations=1500, start=10000, most=40000, density_every=20),
     # Kheradmand et al. 2024: 30,000 steps, a million Gaussians or more.
     "paper": replace(
-        _FAST, iterations=30000, start=100_000, most=1_000_000, density_every=100, window=2048, degree=2, patch_size=128,
+        _FAST, iterations=30000, start=100_000, most=1_000_000, density_every=100, window=2048, degree=2,
         lr_means=0.0016, lr_means_final=0.000016, lr_log_scales=0.005, lr_quaternions=0.001, lr_harmonics=0.0025,
-        ssim_weight=0.2,
+        ssim_weight=0.2, patch_size=128,
     ),
 }  # fmt: skip
 REFINE = replace(
-    _FAST, iterations=300, lr_means=0.0, lr_means_final=0.0, lr_quaternions=0.0, noise=0.0, density_every=0,
+    _FAST, iterations=300, lr_means=0.001, lr_means_final=0.0001, lr_quaternions=0.005, noise=0.0, density_every=0,
     opacity_weight=0.0, scale_weight=0.0, lpips_weight=0.0, background=(0.5, 0.5),
 )  # fmt: skip
-"""Splats that a field gave, on the field's own renders: only colours, opacities and scales change."""
+"""Splats that a field gave, on the field's own renders: their number stays, and they move a little. (A mip360 scene of
+64 pixels: 27.5 dB without moving them, 28.3 dB with, the field itself 28.9 dB.)"""

@@ -1,4 +1,4 @@
-"""Where the Gaussians are: relocation, growth and noise of 3DGS as Markov chain Monte Carlo (Kheradmand et al. 2024)."""
+"""Where the Gaussians are: relocation, growth and noise of 3DGS as a Markov chain (Kheradmand et al. 2024)."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from cat3d_core.splats.gaussians import Gaussians
 
 COPIES = 50
 """At most so many Gaussians take the place of one."""
-_NODES = 48
-_REACH = 6.5
+_NODES = 64
+_REACH = 8.5
 
 
 def split(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
     """Opacity and factor of the scales of each of `copies` (N,) Gaussians that together look like one of `opacity` (N,)
     in [0, 1): 1 - (1 - o)^(1/n), and the factor that keeps the integral of what a ray through them meets (MCMC eq. 9).
 
-    The paper's double sum of alternating binomials is the integral over x, by sqrt(2 pi), of 1 - (1 - o' G(x))^n with G
-    = exp(-x^2 / 2). All terms of the integral are positive, so it loses nothing; the trapezoid rule is exact to rounding
+    The paper's double sum of alternating binomials is the integral over x, by sqrt(2 pi), of 1 - (1 - o' G(x))^n with
+    G = exp(-x^2 / 2). All terms of the integral are positive, so it loses nothing; the trapezoid rule is exact to rounding
     for such functions.
     """
     copies = copies.to(opacity)

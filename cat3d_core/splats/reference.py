@@ -2,7 +2,7 @@
 
 Elliptical weighted averages (Zwicker et al. 2001) as in 3D Gaussian splatting (Kerbl et al. 2023): the image of a
 Gaussian is that of its covariance under the projection linearised at its mean; images are put over one another in the
-order of the means' z-depth. `splats.cpp` computes the same; this file takes memory for every pixel times every Gaussian.
+order of the means' z-depth. `splats.cpp` computes the same; here memory is that of every pixel times every Gaussian.
 """
 
 from __future__ import annotations
@@ -95,9 +95,7 @@ def project(
     zero = torch.zeros_like(x)
     fx, skew, fy = k[0, 0].expand_as(x), k[0, 1].expand_as(x), k[1, 1].expand_as(x)
     jacobian = torch.stack([fx, skew, -(fx * x + skew * y), zero, fy, -fy * y], -1).view(-1, 2, 3) / safe[:, None, None]
-    factor = (
-        jacobian @ pose[:3, :3] @ rotation_matrices(quaternions) * scales[:, None, :]
-    )
+    factor = jacobian @ pose[:3, :3] @ rotation_matrices(quaternions) * scales[:, None, :]
     xx, yy = factor.square().sum(-1).unbind(-1)
     xy = (factor[:, 0] * factor[:, 1]).sum(-1)
     # The determinant as a sum of squares (Cauchy-Binet): nothing cancels, however thin the image is.

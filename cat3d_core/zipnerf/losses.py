@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import torch
 from torch import Tensor
 
@@ -9,6 +11,17 @@ from cat3d_core.zipnerf import stepfun
 from cat3d_core.zipnerf.config import ReconstructConfig
 from cat3d_core.zipnerf.coordinates import power_ladder
 from cat3d_core.zipnerf.render import Round
+
+
+class Trust(Protocol):
+    """Settings of `view_weights`, whatever is reconstructed (see ReconstructConfig)."""
+
+    @property
+    def distance_falloff(self) -> float: ...
+    @property
+    def distance_unit(self) -> float: ...
+    @property
+    def generated_weight_final(self) -> float: ...
 
 
 def charbonnier(difference: Tensor, eps: float) -> Tensor:
@@ -38,7 +51,7 @@ def distortion(final: Round, config: ReconstructConfig) -> Tensor:
     return stepfun.distortion(t, final.weights).mean()
 
 
-def view_weights(centers: Tensor, captured: Tensor, config: ReconstructConfig, progress: float) -> Tensor:
+def view_weights(centers: Tensor, captured: Tensor, config: Trust, progress: float) -> Tensor:
     """Loss weight (N,) of each view at `progress` in [0, 1] through training (CAT3D app., 'Distance based weighting').
 
     Captured views weigh 1; a generated view exp(-b s^2) * g with s the distance of its centre (N, 3, normalised units)
