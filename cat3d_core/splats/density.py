@@ -21,8 +21,8 @@ def split(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
     in [0, 1): 1 - (1 - o)^(1/n), and the factor that keeps the integral of what a ray through them meets (MCMC eq. 9).
 
     The paper's double sum of alternating binomials is the integral over x, by sqrt(2 pi), of 1 - (1 - o' G(x))^n with
-    G = exp(-x^2 / 2). All terms of the integral are positive, so it loses nothing; the trapezoid rule is exact to rounding
-    for such functions.
+    G = exp(-x^2 / 2). All terms of the integral are positive, so it loses nothing; the trapezoid rule is exact to
+    rounding for such functions.
     """
     copies = copies.to(opacity)
     less = torch.log1p(-opacity) / copies

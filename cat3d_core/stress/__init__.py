@@ -3,11 +3,22 @@
 `stress(ROUTINES, cases)` searches; see `routine.Routine` for what a row says and `docs/stress.md` for the results.
 """
 
-from cat3d_core.stress import coordinates, diffusion, geometry, intervals, metrics, networks, poses, rendering, training
+from cat3d_core.stress import (
+    coordinates,
+    diffusion,
+    geometry,
+    intervals,
+    metrics,
+    networks,
+    poses,
+    rendering,
+    splats,
+    training,
+)
 from cat3d_core.stress.routine import Exact, Routine
 from cat3d_core.stress.search import Finding, stress
 
-_SUBJECTS = (geometry, poses, coordinates, intervals, rendering, training, diffusion, networks, metrics)
+_SUBJECTS = (geometry, poses, coordinates, intervals, rendering, splats, training, diffusion, networks, metrics)
 ROUTINES = [routine for subject in _SUBJECTS for routine in subject.ROUTINES]
 
 __all__ = ["ROUTINES", "Exact", "Finding", "Routine", "stress"]

@@ -14,7 +14,8 @@ from cat3d_core.rays import image_rays
 from cat3d_core.splats.config import PRESETS, REFINE, SplatConfig
 from cat3d_core.splats.from_renders import from_renders
 from cat3d_core.splats.gaussians import Gaussians
-from cat3d_core.splats.rasterize import rasterize_cpu, render
+from cat3d_core.splats.rasterize import render
+from cat3d_core.splats.rasterize_cpu import available
 from cat3d_core.splats.trainer import SplatTrainer, expand, train
 from cat3d_core.synthetic import random_cameras, random_scene, trace
 from cat3d_core.zipnerf.coordinates import contract
@@ -22,7 +23,7 @@ from cat3d_core.zipnerf.losses import view_weights
 from cat3d_core.zipnerf.render import Render, normals_from_depth
 from cat3d_core.zipnerf.views import Views
 
-pytestmark = pytest.mark.skipif(not rasterize_cpu.available(), reason="There is no C++ compiler here.")
+pytestmark = pytest.mark.skipif(not available(), reason="There is no C++ compiler here.")
 SHORT = dataclasses.replace(PRESETS["tiny"], iterations=60, start=1500, most=2000)
 
 
