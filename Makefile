@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DEMO_OUT ?= outputs/demo
 DEMO_ARGS ?=
 
-.PHONY: demo test test-slow lint setup clean
+.PHONY: demo test test-slow lint docs figures setup clean
 
 setup: $(VENV)/.installed
 
@@ -25,6 +25,16 @@ test-slow: setup
 
 lint: setup
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
+
+# Reference pages from the code, then the site; a warning fails.
+docs: setup
+	$(BIN)/python -m infra.docs.reference
+	$(BIN)/mkdocs build --quiet --strict --config-file infra/docs/mkdocs.yml
+	@echo "Site: outputs/site/index.html"
+
+# Every picture and table of the documents, from what benchmarks and sweeps left in docs/benchmarks and docs/figures.
+figures: setup
+	$(BIN)/python -m infra.docs.figures
 
 clean:
 	rm -rf $(VENV) outputs build *.egg-info

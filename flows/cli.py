@@ -235,7 +235,9 @@ def bench(
     data: Annotated[Path | None, typer.Option(help="Folder of real scenes, for what needs them.")] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder for benchmarks.md and benchmarks/NAME.parquet; docs in a checkout."),
+        typer.Option(
+            "--out", "-o", help="Folder for benchmarks.md and benchmarks/NAME.parquet; docs/reference in a checkout."
+        ),
     ] = None,
 ) -> None:
     """Run time against error for every stage: tables, fronts, and where the defaults stand on them."""

@@ -19,7 +19,7 @@ class WorkerError(RuntimeError):
 
 def describe(error: BaseException) -> str | None:
     """The sentence a user sees, or None for a fault of ours, which deserves its traceback."""
-    from cat3d_core.zipnerf import NonFiniteError
+    from cat3d_core.reconstruction import NonFiniteError
 
     if isinstance(error, (InputError, StoreError, ConfigError, ServerError, NonFiniteError, WorkerError)):
         return str(error)

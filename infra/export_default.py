@@ -25,10 +25,10 @@ from flows.training.prepare import read_photos
 from flows.training.renders import rendered_images
 
 ROOT = Path(__file__).resolve().parents[1]
-WEIGHTS, CARD = ROOT / "cat3d_core" / "weights" / "default.safetensors", ROOT / "docs" / "model_card.md"
+WEIGHTS, CARD = ROOT / "cat3d_core" / "weights" / "default.safetensors", ROOT / "docs" / "explanation" / "model_card.md"
 START, END = "<!-- numbers: written by infra/export_default.py -->", "<!-- end of numbers -->"
 HELD_OUT_PHOTOS = 6  # for the autoencoder's test
-# What a briefly trained model is at its best with (docs/model_card.md); runs take it from the file.
+# What a briefly trained model is at its best with (docs/explanation/model_card.md); runs take it from the file.
 SAMPLER = {"solver": "ddim", "nodes": "trailing", "steps": 4, "guidance": 1.0}
 
 
@@ -36,7 +36,7 @@ def refine(model: MultiViewModel, training: dict[str, Any], work: Path, minutes:
     """Refine the model's decoder on the bank's renders and the photographs of its training; what was done."""
     perceptual = find_perceptual()
     if perceptual is None:
-        raise SystemExit("--refine needs the weights of a perceptual distance (docs/sweeps.md, 'The tables').")
+        raise SystemExit("--refine needs the weights of a perceptual distance (docs/guides/sweep.md, 'The tables').")
     bank = training["bank"]
     pictures = rendered_images(Path(bank["folder"] or work), 8192)
     photos = read_photos(Path(bank["textures"])) if bank["textures"] else None

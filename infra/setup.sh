@@ -20,7 +20,7 @@ fi
 [ -x "$VENV/bin/python" ] || "$PYTHON" -m venv "$VENV"
 # torch first and pinned exactly, so that a CPU wheel on disk is taken where there is one.
 "$VENV/bin/python" -m pip install -q -c constraints.txt torch
-"$VENV/bin/python" -m pip install -q -c constraints.txt -e '.[test,lint]'
+"$VENV/bin/python" -m pip install -q -c constraints.txt -e '.[test,lint,docs]'
 # Weights only: its code would need torchvision, so its dependencies are left out.
 "$VENV/bin/python" -m pip install -q -c constraints.txt --no-deps stlpips-pytorch ||
     echo "stlpips-pytorch could not be installed; the perceptual metric needs weights of your own then." >&2

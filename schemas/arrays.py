@@ -7,7 +7,7 @@ the fill value: here it is an error. So empty (all-zero) chunks are always writt
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -70,10 +70,16 @@ def _storage(shape: tuple[int, ...], dtype: str, kind: str) -> dict[str, Any]:
     }
 
 
-def create(folder: Path, shape: tuple[int, ...], dtype: str, kind: str) -> None:
-    """Make an array in `folder`. One of the same shape and storage is kept with its data, any other is replaced."""
+def create(
+    folder: Path, shape: tuple[int, ...], dtype: str, kind: str,
+    names: Sequence[str] | None = None, attributes: Mapping[str, str] | None = None,
+) -> None:  # fmt: skip
+    """Make an array in `folder`. One of the same shape and storage is kept with its data, any other is replaced.
+
+    names: of the dimensions. attributes: what is stored with the array, such as its unit.
+    """
     memory: dict[str, Any] = {}
-    zarr.create_array(memory, **_storage(shape, dtype, kind))
+    zarr.create_array(memory, **_storage(shape, dtype, kind), dimension_names=names, attributes=dict(attributes or {}))
     wanted = json.loads(memory["zarr.json"].to_bytes())
     try:
         if read_metadata(folder) == wanted:

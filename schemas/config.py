@@ -87,8 +87,8 @@ class SampleConfig(_Model):
 
     checkpoint: Path | None = None
     """Weights of the model; None: the ones shipped."""
-    solver: Literal["ddim", "dpm++", "unipc"] | None = None
-    """Solver of the probability-flow ODE (paper: ddim)."""
+    solver: str | None = None
+    """Solver of the probability-flow ODE (paper: ddim): ddim, dpm++, unipc, or a further one of the core's SOLVERS."""
     nodes: Literal["trailing", "linspace", "log_snr", "karras"] | None = None
     """Spacing of the noise levels (paper: trailing)."""
     steps: Annotated[int, Field(ge=1)] | None = None
@@ -132,8 +132,10 @@ class ExecutionConfig(_Model):
 class ReconstructConfig(_Model):
     """Fitting the field (paper, section 3.3)."""
 
-    preset: Literal["tiny", "fast", "balanced", "paper"] = "fast"
-    """Point on the measured front of quality against time."""
+    method: str = "zipnerf"
+    """Name of the reconstructor: zipnerf, or that of an installed package."""
+    preset: str = "fast"
+    """Point on the measured front of quality against time; zipnerf has tiny, fast, balanced and paper."""
     overrides: dict[str, Any] = Field(default_factory=dict)
     """Settings of the trainer that replace the preset's."""
 

@@ -15,7 +15,7 @@ import os
 import re
 import shutil
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +118,33 @@ def leftovers(root: Path) -> list[Path]:
         found += [Path(folder, name) for name in (*folders, *files) if name.endswith(".partial")]
         folders[:] = [name for name in folders if not name.endswith(".partial")]
     return sorted(found)
+
+
+def listing(folder: Path) -> list[str]:
+    """Names in a folder, none if a writer has removed it meanwhile."""
+    try:
+        return os.listdir(folder)
+    except FileNotFoundError:
+        return []
+
+
+def nodes(root: Path, path: str = "") -> Iterator[tuple[str, str]]:
+    """(path, "array" | "group" | "damaged") of everything below a group, sorted; hidden names are passed over."""
+    for name in sorted(listing(root / path)):
+        if name.startswith(".") or not (root / path / name).is_dir():
+            continue
+        child = f"{path}/{name}" if path else name
+        try:
+            kind = read_metadata(root / child)["node_type"]
+        except MissingError:
+            if not (root / child).exists():
+                continue
+            kind = "damaged"
+        except StoreError:
+            kind = "damaged"
+        yield child, kind
+        if kind == "group":
+            yield from nodes(root, child)
 
 
 def sync_folder(folder: Path) -> None:

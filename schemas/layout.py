@@ -3,8 +3,8 @@
     scene.zarr/  captured/  latents/  stages/<stage>/
                  runs/<run>/  plan/  generated/  field/  renders/<kind>/  stages/<stage>/
 
-V captured views, N planned views in G groups of up to S, R rendered views, M conditioning views, P points,
-C latent channels.
+Every array carries the names of its dimensions, its unit and its meaning, so that xarray opens each section as a
+dataset and the whole store as a tree.
 Cameras are OpenCV (x right, y down, z forward); K in pixels of the stored image; pixel centres at integer + 0.5.
 """
 
@@ -14,7 +14,9 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
 FORMAT = "cat3d-scene"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+#: Stores from this version on are read as they are; opening one for writing brings it up to date.
+OLDEST_READABLE = 1
 
 #: Stages in the order they run, each with the stages whose results it reads.
 STAGES: dict[str, tuple[str, ...]] = {
@@ -31,169 +33,145 @@ STAGES: dict[str, tuple[str, ...]] = {
 #: Stages done once for a scene; the others are done once for each run.
 SCENE_STAGES = ("ingest", "poses", "encode")
 
-Dim = str | int
+
+@dataclass(frozen=True)
+class Dim:
+    """One dimension: its name as xarray shows it, and its size where the layout fixes it."""
+
+    name: str
+    size: int | None = None
+
+
+# Dimensions that are counted. Each has a name of its own, so that a section and the sections below it can be opened
+# together (xarray wants equal sizes for equal names).
+VIEW, PLANNED, RENDERED = Dim("view"), Dim("planned_view"), Dim("rendered_view")
+CONDITION, GROUP, SLOT, POINT = Dim("condition"), Dim("group"), Dim("slot"), Dim("point")
+Y, X, CHANNEL, LATENT_Y, LATENT_X = Dim("y"), Dim("x"), Dim("latent_channel"), Dim("latent_y"), Dim("latent_x")
+# Dimensions of a fixed size: what each index means stands in the meaning of the array.
+RGB, XYZ, WH, WINDOW = Dim("rgb", 3), Dim("xyz", 3), Dim("wh", 2), Dim("xywh", 4)
+BOUND, BYTE = Dim("bound", 2), Dim("byte", 32)
+K_ROW, K_COLUMN, ROW, COLUMN = Dim("k_row", 3), Dim("k_column", 3), Dim("row", 4), Dim("column", 4)
 
 
 @dataclass(frozen=True)
 class ArraySpec:
-    """One array of the layout. `done` names the array of 32-byte content keys that says which views are there."""
+    """One array of the layout.
+
+    kind: how it is stored (`schemas/arrays.py`). dims: None where the shape is free. unit: "1" for plain numbers, ""
+    for text. done: the array of 32-byte content keys that says which views are there. coordinate: the array labels the
+    entries of its section, and xarray lists it among the coordinates.
+    """
 
     path: str
     kind: str
     dtype: str
     dims: tuple[Dim, ...] | None
     stage: str | None
+    unit: str
     meaning: str
     done: str | None = None
+    coordinate: bool = False
 
     def fits(self, shape: tuple[int, ...]) -> bool:
         """Whether an array of this shape has the dimensions of the layout."""
         if self.dims is None:
             return True
-        return len(shape) == len(self.dims) and all(isinstance(d, str) or d == n for d, n in zip(self.dims, shape))
+        return len(shape) == len(self.dims) and all(d.size in (None, n) for d, n in zip(self.dims, shape))
+
+    @property
+    def section(self) -> str:
+        """Path pattern of the section it is in."""
+        return self.path.rpartition("/")[0]
 
 
+def _marker(path: str, view: Dim, stage: str, note: str = "") -> ArraySpec:
+    return ArraySpec(path, "key", "uint8", (view, BYTE), stage, "1", f"content key of each view, 0 = not done{note}")
+
+
+def _cameras(section: str, view: Dim, stage: str) -> tuple[ArraySpec, ...]:
+    """The arrays that hold the cameras of a section's views, but for their sizes."""
+    return (
+        ArraySpec(f"{section}/intrinsics", "small", "float64", (view, K_ROW, K_COLUMN), stage, "px", "K"),
+        ArraySpec(
+            f"{section}/world_from_camera",
+            "small",
+            "float64",
+            (view, ROW, COLUMN),
+            stage,
+            "scene unit",
+            "camera to scene frame; the similarity to the data set's world is an attribute of captured",
+        ),
+    )
+
+
+_LATENT = (CHANNEL, LATENT_Y, LATENT_X)
+_PLAN, _GENERATED, _RENDERS = "runs/*/plan", "runs/*/generated", "runs/*/renders/*"
+_DONE_RENDER = f"{_RENDERS}/done"
+
+# fmt: off
 LAYOUT: tuple[ArraySpec, ...] = (
-    ArraySpec(
-        "captured/image",
-        "image",
-        "uint8",
-        ("V", "H", "W", 3),
-        "ingest",
-        "sRGB, undistorted, padded with zeros on the right and below to the largest view; see size",
-    ),
-    ArraySpec("captured/mask", "mask", "uint8", ("V", "H", "W"), "ingest", "255 where the pixel counts, padded with 0"),
-    ArraySpec("captured/size", "small", "int32", ("V", 2), "ingest", "[width, height] of each view in pixels"),
-    ArraySpec("captured/name", "small", "str", ("V",), "ingest", "source name, unique in the scene"),
-    ArraySpec("captured/source_sha256", "small", "str", ("V",), "ingest", "sha256 of the source file, hexadecimal"),
-    ArraySpec("captured/intrinsics", "small", "float64", ("V", 3, 3), "poses", "K in pixels"),
-    ArraySpec("captured/world_from_camera", "small", "float64", ("V", 4, 4), "poses", "scene frame, after similarity"),
-    ArraySpec("captured/points", "parameter", "float32", ("P", 3), "poses", "sparse points, scene frame"),
-    ArraySpec("captured/depth_bounds", "small", "float64", ("V", 2), "poses", "[near, far] along z, scene units"),
-    ArraySpec(
-        "latents/captured",
-        "latent",
-        "float16",
-        ("V", "C", "h", "w"),
-        "encode",
-        "encoded captured views",
-        done="latents/done_captured",
-    ),
-    ArraySpec("latents/done_captured", "key", "uint8", ("V", 32), "encode", "content key of each latent, 0 = not done"),
-    ArraySpec(
-        "latents/captured_wide",
-        "latent",
-        "float16",
-        ("V", "C", "h", "w"),
-        "encode",
-        "the same of the views padded to squares, where wide samples are asked for",
-        done="latents/done_captured_wide",
-    ),
-    ArraySpec("latents/done_captured_wide", "key", "uint8", ("V", 32), "encode", "content key, 0 = not done"),
-    ArraySpec("runs/*/role", "small", "uint8", ("V",), None, "role of each captured view, see ROLES"),
-    ArraySpec("runs/*/plan/world_from_camera", "small", "float64", ("N", 4, 4), "plan", "scene frame"),
-    ArraySpec("runs/*/plan/intrinsics", "small", "float64", ("N", 3, 3), "plan", "K in pixels"),
-    ArraySpec("runs/*/plan/size", "small", "int32", ("N", 2), "plan", "[width, height] in pixels"),
-    ArraySpec("runs/*/plan/group", "small", "int32", ("N",), "plan", "group in which the view is sampled"),
-    ArraySpec("runs/*/plan/order", "small", "int32", ("N",), "plan", "place in its group"),
-    ArraySpec("runs/*/plan/anchor", "small", "bool", ("N",), "plan", "sampled first and conditioned upon"),
-    ArraySpec(
-        "runs/*/plan/condition",
-        "small",
-        "int32",
-        ("N", "M"),
-        "plan",
-        "conditioning views: -1 none, below V captured view, V + n the planned view n (an anchor)",
-    ),
-    ArraySpec("runs/*/plan/path", "small", "int32", ("N",), "plan", "path of the trajectory the view is on"),
-    ArraySpec(
-        "runs/*/plan/pose",
-        "small",
-        "int32",
-        ("N",),
-        "plan",
-        "pose of the trajectory: equal for the square and the wide sample of one pose",
-    ),
-    ArraySpec("runs/*/plan/sample_kind", "small", "uint8", ("N",), "plan", "0 square, 1 wide (padded to a square)"),
-    ArraySpec(
-        "runs/*/plan/window",
-        "small",
-        "int32",
-        ("N", 4),
-        "plan",
-        "[x0, y0, width, height] of the sample that shows the scene and not its padding",
-    ),
-    ArraySpec(
-        "runs/*/plan/group_views",
-        "small",
-        "int32",
-        ("G", "S"),
-        "plan",
-        "views of each group in order, short groups filled with repeats; -1 beyond group_targets",
-    ),
-    ArraySpec("runs/*/plan/group_valid", "small", "bool", ("G", "S"), "plan", "False for repeats and beyond"),
-    ArraySpec("runs/*/plan/group_targets", "small", "int32", ("G",), "plan", "target views the network is given"),
-    ArraySpec(
-        "runs/*/generated/latent",
-        "latent",
-        "float16",
-        ("N", "C", "h", "w"),
-        "sample",
-        "sampled latents",
-        done="runs/*/generated/done_latent",
-    ),
-    ArraySpec("runs/*/generated/done_latent", "key", "uint8", ("N", 32), "sample", "content key, 0 = not done"),
-    ArraySpec(
-        "runs/*/generated/image",
-        "image",
-        "uint8",
-        ("N", "H", "W", 3),
-        "decode",
-        "decoded latents, sRGB",
-        done="runs/*/generated/done_image",
-    ),
-    ArraySpec(
-        "runs/*/generated/done_image",
-        "key",
-        "uint8",
-        ("N", 32),
-        "decode",
-        "content key, 0 = not done; a view that is left out on purpose is written as 0",
-    ),
-    ArraySpec("runs/*/field/*", "parameter", "float32", None, "reconstruct", "field parameters and training record"),
-    ArraySpec(
-        "runs/*/renders/*/image",
-        "image",
-        "uint8",
-        ("R", "H", "W", 3),
-        "render",
-        "sRGB, padded; see size",
-        done="runs/*/renders/*/done",
-    ),
-    ArraySpec(
-        "runs/*/renders/*/depth",
-        "depth",
-        "float32",
-        ("R", "H", "W"),
-        "render",
-        "z depth, scene units, padded",
-        done="runs/*/renders/*/done",
-    ),
-    ArraySpec(
-        "runs/*/renders/*/opacity",
-        "depth",
-        "float32",
-        ("R", "H", "W"),
-        "render",
-        "0 to 1, padded",
-        done="runs/*/renders/*/done",
-    ),
-    ArraySpec("runs/*/renders/*/done", "key", "uint8", ("R", 32), "render", "content key of each render, 0 = not done"),
-    ArraySpec("runs/*/renders/*/size", "small", "int32", ("R", 2), "render", "[width, height] in pixels"),
-    ArraySpec("runs/*/renders/*/view", "small", "int32", ("R",), "render", "captured view, or index along the path"),
-    ArraySpec("runs/*/renders/*/intrinsics", "small", "float64", ("R", 3, 3), "render", "K in pixels"),
-    ArraySpec("runs/*/renders/*/world_from_camera", "small", "float64", ("R", 4, 4), "render", "scene frame"),
+    ArraySpec("captured/image", "image", "uint8", (VIEW, Y, X, RGB), "ingest", "sRGB, 0 to 255",
+              "undistorted, padded with zeros on the right and below to the largest view; see size"),
+    ArraySpec("captured/mask", "mask", "uint8", (VIEW, Y, X), "ingest", "1",
+              "255 where the pixel counts, padded with 0"),
+    ArraySpec("captured/size", "small", "int32", (VIEW, WH), "ingest", "px", "[width, height] of each view"),
+    ArraySpec("captured/name", "small", "str", (VIEW,), "ingest", "", "source name, unique in the scene",
+              coordinate=True),
+    ArraySpec("captured/source_sha256", "small", "str", (VIEW,), "ingest", "",
+              "sha256 of the source file, hexadecimal"),
+    *_cameras("captured", VIEW, "poses"),
+    ArraySpec("captured/registered", "small", "bool", (VIEW,), "poses", "1", "whether the view's pose is known"),
+    ArraySpec("captured/points", "parameter", "float32", (POINT, XYZ), "poses", "scene unit",
+              "sparse points, scene frame"),
+    ArraySpec("captured/depth_bounds", "small", "float64", (VIEW, BOUND), "poses", "scene unit", "[near, far] along z"),
+    ArraySpec("latents/captured", "latent", "float16", (VIEW, *_LATENT), "encode", "1", "encoded captured views",
+              done="latents/done_captured"),
+    _marker("latents/done_captured", VIEW, "encode"),
+    ArraySpec("latents/captured_wide", "latent", "float16", (VIEW, *_LATENT), "encode", "1",
+              "the same of the views padded to squares, where wide samples are asked for",
+              done="latents/done_captured_wide"),
+    _marker("latents/done_captured_wide", VIEW, "encode"),
+    ArraySpec("runs/*/role", "small", "uint8", (VIEW,), None, "1", "role of each captured view, see ROLES",
+              coordinate=True),
+    *_cameras(_PLAN, PLANNED, "plan"),
+    ArraySpec(f"{_PLAN}/size", "small", "int32", (PLANNED, WH), "plan", "px", "[width, height]"),
+    ArraySpec(f"{_PLAN}/group", "small", "int32", (PLANNED,), "plan", "1", "group in which the view is sampled"),
+    ArraySpec(f"{_PLAN}/order", "small", "int32", (PLANNED,), "plan", "1", "place in its group"),
+    ArraySpec(f"{_PLAN}/anchor", "small", "bool", (PLANNED,), "plan", "1", "sampled first and conditioned upon",
+              coordinate=True),
+    ArraySpec(f"{_PLAN}/condition", "small", "int32", (PLANNED, CONDITION), "plan", "1",
+              "conditioning views: -1 none, below V captured view, V + n the planned view n (an anchor)"),
+    ArraySpec(f"{_PLAN}/path", "small", "int32", (PLANNED,), "plan", "1", "path of the trajectory the view is on"),
+    ArraySpec(f"{_PLAN}/pose", "small", "int32", (PLANNED,), "plan", "1",
+              "pose of the trajectory: equal for the square and the wide sample of one pose"),
+    ArraySpec(f"{_PLAN}/sample_kind", "small", "uint8", (PLANNED,), "plan", "1",
+              "0 square, 1 wide (padded to a square)"),
+    ArraySpec(f"{_PLAN}/window", "small", "int32", (PLANNED, WINDOW), "plan", "px",
+              "[x0, y0, width, height] of the sample that shows the scene and not its padding"),
+    ArraySpec(f"{_PLAN}/group_views", "small", "int32", (GROUP, SLOT), "plan", "1",
+              "views of each group in order, short groups filled with repeats; -1 beyond group_targets"),
+    ArraySpec(f"{_PLAN}/group_valid", "small", "bool", (GROUP, SLOT), "plan", "1", "False for repeats and beyond"),
+    ArraySpec(f"{_PLAN}/group_targets", "small", "int32", (GROUP,), "plan", "1", "target views the network is given"),
+    ArraySpec(f"{_GENERATED}/latent", "latent", "float16", (PLANNED, *_LATENT), "sample", "1", "sampled latents",
+              done=f"{_GENERATED}/done_latent"),
+    _marker(f"{_GENERATED}/done_latent", PLANNED, "sample"),
+    ArraySpec(f"{_GENERATED}/image", "image", "uint8", (PLANNED, Y, X, RGB), "decode", "sRGB, 0 to 255",
+              "decoded latents", done=f"{_GENERATED}/done_image"),
+    _marker(f"{_GENERATED}/done_image", PLANNED, "decode", "; a view that is left out on purpose is written as 0"),
+    ArraySpec("runs/*/field/*", "parameter", "float32", None, "reconstruct", "1", "field parameters, training record"),
+    ArraySpec(f"{_RENDERS}/image", "image", "uint8", (RENDERED, Y, X, RGB), "render", "sRGB, 0 to 255",
+              "padded; see size", done=_DONE_RENDER),
+    ArraySpec(f"{_RENDERS}/depth", "depth", "float32", (RENDERED, Y, X), "render", "scene unit", "z depth, padded",
+              done=_DONE_RENDER),
+    ArraySpec(f"{_RENDERS}/opacity", "depth", "float32", (RENDERED, Y, X), "render", "1", "0 to 1, padded",
+              done=_DONE_RENDER),
+    _marker(_DONE_RENDER, RENDERED, "render"),
+    ArraySpec(f"{_RENDERS}/size", "small", "int32", (RENDERED, WH), "render", "px", "[width, height]"),
+    ArraySpec(f"{_RENDERS}/view", "small", "int32", (RENDERED,), "render", "1",
+              "captured view, or index along the path", coordinate=True),
+    *_cameras(_RENDERS, RENDERED, "render"),
 )
+# fmt: on
 
 #: Meaning of `runs/<run>/role`.
 ROLES = {"unused": 0, "train": 1, "test": 2}
@@ -207,6 +185,27 @@ def array_spec(path: str) -> ArraySpec | None:
         if len(pattern) == len(parts) and all(map(fnmatchcase, parts, pattern)):
             return spec
     return None
+
+
+def describe(path: str, shape: tuple[int, ...]) -> tuple[list[str], dict[str, str]]:
+    """(dimension names, attributes) that are stored with the array at `path`, known to the layout or not.
+
+    The attributes follow the CF conventions, which xarray reads: `units`, `long_name`, `coordinates`.
+    """
+    spec = array_spec(path)
+    if spec is None:
+        return _free_names(path, shape), {}
+    attributes = {"long_name": spec.meaning} | ({"units": spec.unit} if spec.unit else {})
+    labels = [other.path.rpartition("/")[2] for other in LAYOUT if other.coordinate and other.section == spec.section]
+    if labels:
+        attributes["coordinates"] = " ".join(labels)
+    fixed = spec.dims is not None and spec.fits(shape)
+    return [d.name for d in spec.dims or ()] if fixed else _free_names(path, shape), attributes
+
+
+def _free_names(path: str, shape: tuple[int, ...]) -> list[str]:
+    """Names for the dimensions of an array of free shape, equal to no other array's."""
+    return [f"{path.rpartition('/')[2]}_{axis}" for axis in range(len(shape))]
 
 
 def done_path(path: str) -> str | None:

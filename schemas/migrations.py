@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from schemas.documents import read_group, write_group
+from schemas.documents import nodes, read_group, read_metadata, write_group, write_metadata
 from schemas.errors import StoreError
-from schemas.layout import SCENE_STAGES, SCHEMA_VERSION, STAGES
+from schemas.layout import SCENE_STAGES, SCHEMA_VERSION, STAGES, describe
 
 
 def _from_0(store: Path) -> None:
@@ -36,8 +36,20 @@ def _from_0(store: Path) -> None:
     write_group(store, {**attributes, "schema_version": 1})
 
 
+def _from_1(store: Path) -> None:
+    """Version 1 had neither names of dimensions nor units. Metadata changes; chunks and records stay as they are."""
+    for path, kind in nodes(store):
+        if kind == "array":
+            document = read_metadata(store / path)
+            names, attributes = describe(path, tuple(document["shape"]))
+            described = {**document, "attributes": {**document["attributes"], **attributes}, "dimension_names": names}
+            if described != document:
+                write_metadata(store / path, described)
+    write_group(store, {**read_group(store), "schema_version": 2})
+
+
 #: Version -> what brings a store of that version to the next.
-MIGRATIONS: dict[int, Callable[[Path], None]] = {0: _from_0}
+MIGRATIONS: dict[int, Callable[[Path], None]] = {0: _from_0, 1: _from_1}
 
 
 def migrate(store: Path) -> int:

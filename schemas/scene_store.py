@@ -14,7 +14,7 @@ from typing import Any, Literal
 from schemas import migrations
 from schemas.documents import checked_name, leftovers, read_metadata
 from schemas.errors import MissingError, StoreError
-from schemas.layout import FORMAT, SCENE_STAGES, SCHEMA_VERSION, STAGES, check_stage, downstream
+from schemas.layout import FORMAT, OLDEST_READABLE, SCENE_STAGES, SCHEMA_VERSION, STAGES, check_stage, downstream
 from schemas.section import Section, make_tree
 from schemas.stages import StageRecord, read_record, remove_record, write_record
 
@@ -83,11 +83,11 @@ class SceneStore(Section):
             raise StoreError(
                 f"{path} has schema version {version}, and this cat3d knows those up to {SCHEMA_VERSION}: update cat3d."
             )
-        if version < SCHEMA_VERSION:
-            if mode == "r":
-                raise StoreError(
-                    f"{path} has the older schema version {version}: open it once for writing to bring it up to date."
-                )
+        if version < OLDEST_READABLE and mode == "r":
+            raise StoreError(
+                f"{path} has the older schema version {version}: open it once for writing to bring it up to date."
+            )
+        if version < SCHEMA_VERSION and mode == "r+":
             migrations.migrate(path)
             attributes = _root_attributes(path)
         for name in ("scene_id", "dataset", "provenance"):

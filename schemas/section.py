@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from schemas import arrays
 from schemas.documents import checked_name, discard, plain, read_group, write_group
 from schemas.errors import MissingError, StoreError
-from schemas.layout import array_spec
+from schemas.layout import array_spec, describe
 
 
 class Section:
@@ -65,14 +65,16 @@ class Section:
         """
         self._check_writable()
         wanted = tuple(int(n) for n in shape)
-        spec = array_spec(join(self.path, checked_name(name)))
+        path = join(self.path, checked_name(name))
+        spec = array_spec(path)
         if spec is not None:
             dtype, kind = dtype or spec.dtype, kind or spec.kind
         if dtype is None or kind is None:
-            raise ValueError(f"The layout doesn't know {join(self.path, name)!r}: say its dtype and kind.")
+            raise ValueError(f"The layout doesn't know {path!r}: say its dtype and kind.")
         if spec is not None and not spec.fits(wanted):
-            raise StoreError(f"{join(self.path, name)} has the dimensions {spec.dims}, but {wanted} was asked for.")
-        arrays.create(self.folder / name, wanted, dtype, kind)
+            dims = ", ".join(d.name if d.size is None else f"{d.name} = {d.size}" for d in spec.dims or ())
+            raise StoreError(f"{path} has the dimensions ({dims}), but {wanted} was asked for.")
+        arrays.create(self.folder / name, wanted, dtype, kind, *describe(path, wanted))
 
     def write(self, name: str, values: Any, dtype: str | None = None, kind: str | None = None) -> None:
         """Write a whole array, making it first."""

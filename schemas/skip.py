@@ -1,4 +1,4 @@
-"""What a scene may do without: the one place with all switches (rules and measurements: docs/skips.md)."""
+"""What a scene may do without: the one place with all switches (rules and measurements: docs/explanation/skips.md)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class SkipConfig(StrictModel):
     """Work that a scene may not need, a switch for each; `skip: none` and `skip: all` set all of them.
 
     A switch that is off changes no result. What was skipped, why and what it saved is among the decisions of the
-    stage. What the defaults save and cost: docs/skips.md.
+    stage. What the defaults save and cost: docs/explanation/skips.md.
     """
 
     coverage: bool = True

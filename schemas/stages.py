@@ -8,6 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from schemas.decisions import Decision
 from schemas.documents import discard, plain, read_group, write_group
 from schemas.errors import MissingError, StoreError
 
@@ -26,7 +27,7 @@ class StageRecord(BaseModel):
     finished_at: str
     seconds: float = Field(ge=0)
     work: dict[str, float] = Field(default_factory=dict)
-    decisions: list[str] = Field(default_factory=list, description="what was chosen or skipped, and why, as sentences")
+    decisions: list[Decision] = Field(default_factory=list, description="what was chosen or skipped, and why")
 
 
 def now() -> str:

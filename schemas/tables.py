@@ -23,59 +23,57 @@ from schemas.errors import StoreError
 SEAL = b"rows_sha256"
 
 
-def _field(name: str, kind: pa.DataType, meaning: str, unit: str = "", required: bool = False) -> pa.Field:
+def column(name: str, kind: pa.DataType, meaning: str, unit: str = "", required: bool = False) -> pa.Field:
+    """A column that says what it means and in which unit."""
     return pa.field(name, kind, nullable=not required, metadata={"meaning": meaning, "unit": unit})
 
 
 _WHAT = (
-    _field("scene_id", pa.string(), "scene", required=True),
-    _field("dataset", pa.string(), "data set the scene belongs to"),
-    _field("run", pa.string(), "run of the scene: a split and a method"),
-    _field("method", pa.string(), "zipnerf, cat3d, or the name of an ablation"),
-    _field("split", pa.string(), "captured views trained on: 1, 3, 6, 9, all, or the name of a split file"),
-    _field("seed", pa.int64(), "seed of the run"),
-    _field("key", pa.string(), "content key of the stage that made the row", required=True),
-    _field("code_version", pa.string(), "version of the code that made the row"),
+    column("scene_id", pa.string(), "scene", required=True),
+    column("dataset", pa.string(), "data set the scene belongs to"),
+    column("run", pa.string(), "run of the scene: a split and a method"),
+    column("method", pa.string(), "zipnerf, cat3d, or the name of an ablation"),
+    column("split", pa.string(), "captured views trained on: 1, 3, 6, 9, all, or the name of a split file"),
+    column("seed", pa.int64(), "seed of the run"),
+    column("key", pa.string(), "content key of the stage that made the row", required=True),
+    column("code_version", pa.string(), "version of the code that made the row"),
 )
 
-METRICS = pa.schema(
-    [
-        *_WHAT,
-        _field("protocol", pa.string(), "how the metrics are computed: google, regnerf, …", required=True),
-        _field("view", pa.int32(), "index of the captured view", required=True),
-        _field("view_name", pa.string(), "source name of the view"),
-        _field("width", pa.int32(), "width of the compared images", "px", required=True),
-        _field("height", pa.int32(), "height of the compared images", "px", required=True),
-        _field("psnr_db", pa.float64(), "peak signal-to-noise ratio, sRGB, peak 1", "dB"),
-        _field("ssim", pa.float64(), "structural similarity as the protocol defines it", "1"),
-        _field("lpips", pa.float64(), "perceptual distance by the named backbone", "1"),
-        _field("lpips_backbone", pa.string(), "network and weights of lpips"),
-        _field("clip_score", pa.float64(), "cosine of CLIP embeddings, render against photo", "1"),
-        _field("clip_network", pa.string(), "image tower and weights of clip_score"),
-        _field("depth_abs_rel", pa.float64(), "mean |z - z_true| / z_true where the truth is known", "1"),
-        _field("surface_chamfer", pa.float64(), "mean of both ways' distances between rendered and true surface points "
-               "of the view, as far as 2 scene units from the origin", "scene units"),
-        _field("masked", pa.bool_(), "whether a mask was applied"),
-    ],
-    metadata={"format": "cat3d-metrics", "schema_version": "2", "row": "one rendered view under one protocol"},
-)  # fmt: skip
+
+def metrics_schema(columns: Sequence[pa.Field]) -> pa.Schema:
+    """The table of metrics, a row for one rendered view under one protocol, with the columns of these metrics (see
+    `column`)."""
+    return pa.schema(
+        [
+            *_WHAT,
+            column("protocol", pa.string(), "how the metrics are computed: google, regnerf, …", required=True),
+            column("view", pa.int32(), "index of the captured view", required=True),
+            column("view_name", pa.string(), "source name of the view"),
+            column("width", pa.int32(), "width of the compared images", "px", required=True),
+            column("height", pa.int32(), "height of the compared images", "px", required=True),
+            *columns,
+            column("masked", pa.bool_(), "whether a mask was applied"),
+        ],
+        metadata={"format": "cat3d-metrics", "schema_version": "2", "row": "one rendered view under one protocol"},
+    )
+
 
 TIMINGS = pa.schema(
     [
         *_WHAT,
-        _field("stage", pa.string(), "stage of the pipeline", required=True),
-        _field("started_at", pa.timestamp("us", "UTC"), "start", "s", required=True),
-        _field("seconds", pa.float64(), "wall time of the execution", "s", required=True),
-        _field("skipped", pa.bool_(), "the stage was complete already and did nothing"),
-        _field("views", pa.int64(), "views read or made", "1"),
-        _field("rays", pa.int64(), "rays cast", "1"),
-        _field("evaluations", pa.int64(), "evaluations of the network or field", "1"),
-        _field("steps", pa.int64(), "optimisation or sampler steps", "1"),
-        _field("bytes_written", pa.int64(), "bytes written to the store", "B"),
-        _field("peak_memory_bytes", pa.int64(), "largest resident or device memory", "B"),
-        _field("workers", pa.int32(), "processes that shared the work", "1"),
-        _field("device", pa.string(), "cpu, or the name of the accelerator"),
-        _field("host", pa.string(), "name of the machine"),
+        column("stage", pa.string(), "stage of the pipeline", required=True),
+        column("started_at", pa.timestamp("us", "UTC"), "start", "s", required=True),
+        column("seconds", pa.float64(), "wall time of the execution", "s", required=True),
+        column("skipped", pa.bool_(), "the stage was complete already and did nothing"),
+        column("views", pa.int64(), "views read or made", "1"),
+        column("rays", pa.int64(), "rays cast", "1"),
+        column("evaluations", pa.int64(), "evaluations of the network or field", "1"),
+        column("steps", pa.int64(), "optimisation or sampler steps", "1"),
+        column("bytes_written", pa.int64(), "bytes written to the store", "B"),
+        column("peak_memory_bytes", pa.int64(), "largest resident or device memory", "B"),
+        column("workers", pa.int32(), "processes that shared the work", "1"),
+        column("device", pa.string(), "cpu, or the name of the accelerator"),
+        column("host", pa.string(), "name of the machine"),
     ],
     metadata={"format": "cat3d-timings", "schema_version": "1", "row": "one execution of one stage"},
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 from zarr.codecs import Crc32cCodec
 
 from schemas import arrays
-from schemas.documents import SEAL, leftovers, read_metadata
+from schemas.documents import SEAL, leftovers, listing, nodes, read_metadata
 from schemas.errors import MissingError, StoreError
 from schemas.layout import SCENE_STAGES, array_spec, done_path
 from schemas.scene_store import SceneStore
@@ -24,25 +23,6 @@ class Problem:
     path: str
     message: str
     chunk: tuple[int, ...] | None = None
-
-
-def nodes(root: Path, path: str = "") -> Iterator[tuple[str, str]]:
-    """(path, "array" | "group" | "damaged") of everything below a group, sorted; hidden names are passed over."""
-    for name in sorted(_listing(root / path)):
-        if name.startswith(".") or not (root / path / name).is_dir():
-            continue
-        child = f"{path}/{name}" if path else name
-        try:
-            kind = read_metadata(root / child)["node_type"]
-        except MissingError:
-            if not (root / child).exists():
-                continue
-            kind = "damaged"
-        except StoreError:
-            kind = "damaged"
-        yield child, kind
-        if kind == "group":
-            yield from nodes(root, child)
 
 
 def verify(store: SceneStore) -> Iterator[Problem]:
@@ -83,19 +63,11 @@ def verify_array(store: SceneStore, path: str) -> Iterator[Problem]:
                 found.append(Problem("missing", path, str(error), chunk))
         except StoreError as error:
             found.append(Problem("corrupted", path, str(error), chunk))
-    for file in map(folder.joinpath, sorted(_listing(folder))):
+    for file in map(folder.joinpath, sorted(listing(folder))):
         if file.is_file() and file.name not in expected and not file.name.endswith(".partial"):
             found.append(Problem("orphan", f"{path}/{file.name}", f"{file} belongs to no chunk of the array."))
     if _version(folder) == version:  # else a writer has replaced the array meanwhile: what was read were two halves
         yield from found
-
-
-def _listing(folder: Path) -> list[str]:
-    """Names in a folder, none if a writer has removed it meanwhile."""
-    try:
-        return os.listdir(folder)
-    except FileNotFoundError:
-        return []
 
 
 def _version(folder: Path) -> tuple[int, int] | None:

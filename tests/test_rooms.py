@@ -54,7 +54,7 @@ def test_core_imports_with_only_torch_numpy_and_safetensors() -> None:
 
 
 def test_training_needs_none_of_the_packages_that_a_borrowed_gpu_lacks() -> None:
-    """What infra/gpu/lease.sh runs there, with the packages it carries (docs/training.md)."""
+    """What infra/gpu/lease.sh runs there, with the packages it carries (docs/guides/training.md)."""
     blocked = ["prefect", "zarr", "numcodecs", "open3d", "pycolmap", "imageio_ffmpeg", "fastapi", "jinja2"]
     modules = ["flows.cli", "flows.errors", "flows.commands.train", "flows.bench.model", "flows.bench.reconstruct"]
     code = (

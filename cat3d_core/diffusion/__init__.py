@@ -9,7 +9,7 @@ from cat3d_core.diffusion.model import MultiViewModel
 from cat3d_core.diffusion.sampler import SamplerConfig, sample
 from cat3d_core.diffusion.schedule import Schedule
 from cat3d_core.diffusion.training import TrainConfig, Trainer, diffusion_loss
-from cat3d_core.diffusion.unet import MultiViewUNet, compile_blocks, count_flops, count_parameters
+from cat3d_core.diffusion.unet import MultiViewUNet, count_flops, count_parameters
 
 __all__ = [
     "SIZES",
@@ -27,7 +27,6 @@ __all__ = [
     "Trainer",
     "UNetConfig",
     "autoencoder_loss",
-    "compile_blocks",
     "count_flops",
     "count_parameters",
     "describe",

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor, nn
+from torch import Tensor
 
 from cat3d_core.diffusion.autoencoder import ENCODER
 from cat3d_core.diffusion.config import ModelConfig
@@ -108,11 +108,6 @@ def load_state(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     if "state" not in metadata:
         raise ValueError(f"{path} is no saved training state.")
     return state, json.loads(metadata["state"])
-
-
-def copy_weights(source: nn.Module, target: nn.Module) -> None:
-    """Copy parameters and buffers between two modules of one architecture, converting dtype and device."""
-    target.load_state_dict(source.state_dict())
 
 
 def _write(path: Path, state: dict[str, Tensor], metadata: dict[str, str]) -> None:

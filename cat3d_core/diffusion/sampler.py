@@ -12,7 +12,7 @@ from cat3d_core.diffusion.conditioning import Condition, make_condition
 from cat3d_core.diffusion.guidance import GuidanceConfig, guided
 from cat3d_core.diffusion.model import MultiViewModel
 from cat3d_core.diffusion.schedule import Nodes, Schedule
-from cat3d_core.diffusion.solvers import SolverName, integrate
+from cat3d_core.diffusion.solvers import check_solver, integrate
 
 
 @dataclass(frozen=True)
@@ -21,13 +21,17 @@ class SamplerConfig:
 
     micro_batch: always run the network on exactly this many groups (the last batch is filled up by repetition), so that
     kernels see one shape only. With 1, a group's result is bit-identical however many groups are sampled with it.
+    Raises ValueError for a solver that there isn't.
     """
 
-    solver: SolverName = "unipc"
+    solver: str = "unipc"
     nodes: Nodes = "log_snr"
     steps: int = 20
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
     micro_batch: int | None = None
+
+    def __post_init__(self) -> None:
+        check_solver(self.solver)
 
     @classmethod
     def reference(cls) -> SamplerConfig:

@@ -45,8 +45,12 @@ class TrainConfig:
         if step < self.warmup_steps:
             return self.learning_rate * (step + 1) / self.warmup_steps
         progress = (step - self.warmup_steps) / max(self.total_steps - self.warmup_steps, 1)
-        fall = 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
-        return self.final_learning_rate + (self.learning_rate - self.final_learning_rate) * fall
+        return half_cosine(self.learning_rate, self.final_learning_rate, progress)
+
+
+def half_cosine(first: float, last: float, progress: float) -> float:
+    """From `first` at progress 0 to `last` at 1 and beyond, along half a cosine."""
+    return last + (first - last) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
 
 
 def diffusion_loss(

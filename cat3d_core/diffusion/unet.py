@@ -161,13 +161,6 @@ class Level(nn.Module):
         return x
 
 
-def compile_blocks(unet: MultiViewUNet) -> None:
-    """torch.compile each repeated block in place: nearly the speed of compiling the whole at a tenth of the wait."""
-    for module in unet.modules():
-        if isinstance(module, (ResnetBlock, SpatialTransformer)):
-            module.compile()
-
-
 def count_flops(config: UNetConfig, views: int = 8) -> int:
     """Floating-point operations (2 per multiply-add) of one evaluation of one group, counted without computing it."""
     from torch.utils.flop_counter import FlopCounterMode

@@ -5,6 +5,7 @@ from cat3d_core.splats.config import PRESETS, REFINE, SplatConfig
 from cat3d_core.splats.from_renders import from_renders
 from cat3d_core.splats.gaussians import Gaussians
 from cat3d_core.splats.rasterize import render
+from cat3d_core.splats.reconstructor import Splats
 from cat3d_core.splats.trainer import SplatTrainer, train
 
 __all__ = [
@@ -13,8 +14,8 @@ __all__ = [
     "Gaussians",
     "SplatConfig",
     "SplatTrainer",
+    "Splats",
     "from_renders",
-    "rasterize",
     "render",
     "train",
 ]

@@ -39,6 +39,10 @@ class SplatConfig:
     lpips_weight: float = 0.02
     lpips_every: int = 2
     """Take the LPIPS loss at every k-th step only, its weight times k there."""
+    depth_prior: float = 0.0
+    """Weight of the loss on inverse depth where views come with depths."""
+    depth_prior_until: float = 1.0
+    """Share of the training over which that weight falls to 0."""
     patch_size: int = 64
     """Side of the square that the LPIPS loss sees of a window."""
     opacity_weight: float = 0.01
@@ -87,6 +91,8 @@ class SplatConfig:
             raise ValueError("near and far are positive, far the larger, and shell lies in [0, 1).")
         if not (0.0 < self.lr_final <= 1.0 and 0.0 <= self.lr_means_final <= self.lr_means):
             raise ValueError("Learning rates fall: lr_final lies in (0, 1], lr_means_final in [0, lr_means].")
+        if not (self.depth_prior >= 0.0 and 0.0 <= self.depth_prior_until <= 1.0):
+            raise ValueError("depth_prior is at least 0, and depth_prior_until lies in [0, 1].")
         if not 0.0 < self.start_opacity < 1.0 or not 0.0 < self.dead_opacity < 1.0:
             raise ValueError("start_opacity and dead_opacity lie between 0 and 1.")
 

@@ -7,10 +7,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from cat3d_core.cameras import Cameras
+from cat3d_core.reconstruction.render import Render
 from cat3d_core.splats import rasterize_cpu, rasterize_gsplat, reference
 from cat3d_core.splats.gaussians import Gaussians
 from cat3d_core.splats.reference import Raster, Window
-from cat3d_core.zipnerf.render import Render
 
 FAR = 1e6
 """Depth (scene units) of pixels that show nothing, as a field's."""

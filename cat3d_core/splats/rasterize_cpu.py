@@ -26,7 +26,7 @@ from cat3d_core.splats.reference import (
 SOURCE = "splats/splats"
 TILE = 8  # as in the kernels
 IMAGE, SHAPE = 9, 7  # numbers of an image, and of its gradient without the features'
-CHANNELS = (1, 3, 6)
+CHANNELS = (1, 3, 4, 6)
 
 
 def available() -> bool:
@@ -105,7 +105,7 @@ def rasterize(
     means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, features: Tensor,
     camera: Cameras, window: Window | None = None, antialias: bool = True,
 ) -> Raster:  # fmt: skip
-    """As `reference.rasterize` for float32 or float64 tensors on the CPU with 1, 3 or 6 features; deterministic, the
+    """As `reference.rasterize` for float32 or float64 tensors on the CPU with 1, 3, 4 or 6 features; deterministic, the
     same with any number of threads.
 
     Raises ValueError for shapes and dtypes that do not fit (the kernels check nothing).

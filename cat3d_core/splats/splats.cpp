@@ -448,7 +448,7 @@ void backward(const Scene<R>& in, const Lists& lists, const int64_t* place, cons
                                   int32_t* last, R* median, int threads) {                                                                                 \
         const Size size = *(const Size*)window;                                                                                                            \
         make_lists(order, shown, (const Rectangle*)tiles, size, begins, gaussian, place);                                                                  \
-        switch (channels) { FORWARD(R, 1) FORWARD(R, 3) FORWARD(R, 6) }                                                                                    \
+        switch (channels) { FORWARD(R, 1) FORWARD(R, 3) FORWARD(R, 4) FORWARD(R, 6) }                                                                                    \
         return 1;                                                                                                                                          \
     }                                                                                                                                                      \
     extern "C" int NAME##_backward(const R* means, const R* quaternions, const R* scales, const R* opacities, int64_t count, const R* images,              \
@@ -456,7 +456,7 @@ void backward(const Scene<R>& in, const Lists& lists, const int64_t* place, cons
                                    const int32_t* window, const int64_t* begins, const int32_t* gaussian, const int64_t* place, const R* light,            \
                                    const int32_t* last, const R* gradient, const R* light_gradient, R* scratch, R* g_means, R* g_quaternions,              \
                                    R* g_scales, R* g_opacities, R* g_features, int threads) {                                                              \
-        switch (channels) { BACKWARD(R, 1) BACKWARD(R, 3) BACKWARD(R, 6) }                                                                                 \
+        switch (channels) { BACKWARD(R, 1) BACKWARD(R, 3) BACKWARD(R, 4) BACKWARD(R, 6) }                                                                                 \
         return 1;                                                                                                                                          \
     }
 #define FORWARD(R, C)                                                                                                                                      \

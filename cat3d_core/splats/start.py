@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from cat3d_core.rays import Rays, pixel_rays
+from cat3d_core.reconstruction.views import Views, draw_views
 from cat3d_core.splats.config import SplatConfig
 from cat3d_core.splats.gaussians import Gaussians, harmonics_of_colour
-from cat3d_core.zipnerf.views import Views, draw_views
 
 DEPTHS = 48
 """Depths that are tried along a ray, evenly spaced in disparity."""
@@ -25,14 +25,16 @@ def start(views: Views, config: SplatConfig, generator: torch.Generator) -> Gaus
     """`config.start` Gaussians: round, grey where nothing is known, as wide as the pixels that each stands for.
 
     A plane sweep (Collins 1996) over single rays: of each drawn pixel the depth is taken at which other views show the
-    most similar colour. That is often wrong, and better than a depth at random. A share of them stands on a far shell.
+    most similar colour, unless the views know it. That is often wrong, and better than a depth at random. A share of
+    them stands on a far shell.
     """
     device = views.pixels.device
     count = config.start
     view = draw_views(views, count, config.captured_share, generator)
     number = torch.rand(count, generator=generator, device=device, dtype=torch.float64)
     xy = views.pixel(view, (number * views.counting[view]).long().clamp_max(views.counting[view] - 1).clamp_min(0))
-    colour, _ = views.colours(view, xy)
+    seen = views.batch(view, xy, 1)
+    colour = seen.rgb
     rays = pixel_rays(views.cameras, view, xy + 0.5)
     jitter = torch.rand((count, DEPTHS), generator=generator, device=device)
     share = (torch.arange(DEPTHS, device=device) + jitter) / DEPTHS
@@ -44,6 +46,9 @@ def start(views: Views, config: SplatConfig, generator: torch.Generator) -> Gaus
             for rows in torch.arange(count, device=device).split(CHUNK)
         ]
     )
+    if seen.inverse_depth is not None and seen.inverse_depth_weight is not None:
+        known = seen.inverse_depth_weight > 0.5
+        depth = torch.where(known, 1.0 / seen.inverse_depth.clamp(1.0 / config.far, 1.0 / config.near), depth)
     shell = torch.rand(count, generator=generator, device=device) < config.shell
     depth = torch.where(shell, config.far, depth)
     pixels = views.counting.sum() / count  # that each stands for
@@ -75,9 +80,9 @@ def _agreeing(views: Views, others: Tensor, rays: Rays, view: Tensor, colour: Te
         xy, size = pixels[row].floor(), views.size[other]
         seen = (z[row] > 0) & (xy >= 0).all(-1) & (xy < size).all(-1)
         at = torch.minimum(xy.clamp_min(0), size - 1).long()
-        found, valid = views.colours(other.expand(len(at)), at)
-        difference = (found.view(*depths.shape, 3) - colour[:, None]).abs().mean(-1).clamp_max(OUTLIER)
-        known = (seen & (valid > 0)).view_as(depths) & (view != other)[:, None]
+        found = views.batch(other.expand(len(at)), at, 1)
+        difference = (found.rgb.view(*depths.shape, 3) - colour[:, None]).abs().mean(-1).clamp_max(OUTLIER)
+        known = (seen & (found.valid > 0)).view_as(depths) & (view != other)[:, None]
         total = total + torch.where(known, difference, UNSEEN)
     best = total.argmin(1, keepdim=True)
     return depths.gather(1, best)[:, 0]

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from cat3d_core.metrics.ssim import ssim_map
 from cat3d_core.random import derive_seed
+from cat3d_core.reconstruction.protocol import NonFiniteError
+from cat3d_core.reconstruction.views import Views, draw_views
 from cat3d_core.splats.config import SplatConfig
 from cat3d_core.splats.density import noise, relocate
 from cat3d_core.splats.gaussians import Gaussians
@@ -18,7 +20,6 @@ from cat3d_core.splats.start import start
 from cat3d_core.zipnerf import losses
 from cat3d_core.zipnerf.adam import Adam
 from cat3d_core.zipnerf.coordinates import contract
-from cat3d_core.zipnerf.views import Views, draw_views
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]
 OUTERMOST = 2.0 - 1e-3
@@ -97,8 +98,8 @@ class SplatTrainer:
         """One iteration: loss terms, psnr of what it saw, learning rate of the means, number of Gaussians, and how many
         steps were skipped so far.
 
-        A step whose loss or gradient is not finite changes nothing but the count. Raises ValueError after more than
-        `max_skipped_steps` of them.
+        A step whose loss or gradient is not finite changes nothing but the count. Raises NonFiniteError after more
+        than `max_skipped_steps` of them.
         """
         c = self.config
         generator = self._generator("step", self.iteration)
@@ -109,9 +110,10 @@ class SplatTrainer:
         seen = draw_views(self.views, c.views_per_step, c.captured_share, generator).tolist()
         trust = losses.view_weights(self.views.cameras.centers, self.views.captured, c, self.progress)
         totals: dict[str, Tensor] = {}
+        rays = float(sum(min(c.window, side[0]) * min(c.window, side[1]) for side in self.views.size[seen].tolist()))
         for view in seen:
             terms = self._losses(view, float(trust[view]), generator)
-            torch.stack([value for name, value in terms.items() if name != "mse"]).sum().backward()
+            (torch.stack([value for name, value in terms.items() if name != "mse"]).sum() / len(seen)).backward()
             for name, value in terms.items():
                 totals[name] = totals.get(name, torch.zeros_like(value)) + value.detach() / len(seen)
         live = [p for p in self.parameters.values() if p.grad is not None]
@@ -128,10 +130,17 @@ class SplatTrainer:
         result = {name: float(value) for name, value in totals.items()}
         mse = result.pop("mse")
         psnr = -10.0 * math.log10(mse) if 0.0 < mse < math.inf else math.nan
-        numbers = {"lr": rates["means"], "gaussians": float(len(self.parameters["logits"]))}
-        return {**result, "loss": sum(result.values()), "psnr": psnr, **numbers, "skipped": float(self.skipped)}
+        numbers = {"lr": rates["means"], "gaussians": float(len(self.parameters["logits"])), "rays": rays}
+        return {
+            **result,
+            "loss": sum(result.values()),
+            "psnr": psnr,
+            **numbers,
+            "rays": rays,
+            "skipped": float(self.skipped),
+        }
 
-    def _window(self, view: int, side: int, within: Window, generator: torch.Generator) -> Window:
+    def _window(self, side: int, within: Window, generator: torch.Generator) -> Window:
         """A window of at most `side` pixels a side, at random within another."""
         width, height = min(side, within.width), min(side, within.height)
         share = torch.rand(2, generator=generator, device=self.device).tolist()
@@ -139,42 +148,52 @@ class SplatTrainer:
         return Window(within.x0 + x, within.y0 + y, width, height)
 
     def _losses(self, view: int, trust: float, generator: torch.Generator) -> dict[str, Tensor]:
-        c = self.config
-        width, height = self.views.size[view].tolist()
-        window = self._window(view, c.window, Window(0, 0, width, height), generator)
-        x, y = slice(window.x0, window.x0 + window.width), slice(window.y0, window.y0 + window.height)
-        target = self.views.image(view)[y, x].permute(2, 0, 1).float() / 255.0
-        weight = torch.full(target.shape[1:], trust / c.views_per_step, device=self.device)
-        if self.views.valid is not None:
-            first = int(self.views.offset[view])
-            valid = self.views.valid[first : first + width * height].view(height, width)[y, x]
-            weight = weight * valid
+        c, views = self.config, self.views
+        width, height = views.size[view].tolist()
+        window = self._window(c.window, Window(0, 0, width, height), generator)
+        part = slice(window.y0, window.y0 + window.height), slice(window.x0, window.x0 + window.width)
+        target = views.image(view)[part].permute(2, 0, 1).float() / 255.0
+        valid = torch.ones_like(target[0]) if views.valid is None else views.map(views.valid, view)[part].float()
+        weight = trust * (valid if views.weight is None else valid * views.map(views.weight, view)[part])
         low, high = c.background
         grey = low + (high - low) * float(torch.rand((), generator=generator, device=self.device))
-        gaussians = self.gaussians
-        raster = rasterize(gaussians, self.views.cameras[view], window, c.antialias)
-        image = raster.features + (1.0 - raster.opacity) * grey
+        gaussians, camera = self.gaussians, views.cameras[view]
+        features = gaussians.colours(camera.centers[0])
+        prior = losses.annealed(c.depth_prior, c.depth_prior_until, self.progress)
+        known = None if views.inverse_depth is None or prior == 0 else views.map(views.inverse_depth, view)[part]
+        if known is not None:
+            features = torch.cat([features, self._inverse_depths(gaussians, view)[:, None]], 1)
+        raster = rasterize(gaussians, camera, window, c.antialias, features)
+        image = raster.features[:3] + (1.0 - raster.opacity) * grey
         difference = image - target
-        counted = weight > 0
         terms = {
             "photometric": (losses.charbonnier(difference, c.charbonnier_eps).mean(0) * weight).mean(),
-            "mse": (difference.detach().square().mean(0) * counted).sum() / counted.sum().clamp_min(1),
+            "mse": (difference.detach().square().mean(0) * valid).sum() / valid.sum().clamp_min(1),
         }
+        if known is not None and views.inverse_depth_weight is not None:
+            share = trust * valid * views.map(views.inverse_depth_weight, view)[part]
+            terms["depth"] = prior * (share * losses.charbonnier(raster.features[3] - known, 1e-3)).mean()
         if c.ssim_weight:
-            map = ssim_map(image[None], target[None], "gaussian_same")[0].mean(0).to(weight)
-            terms["ssim"] = c.ssim_weight * ((1.0 - map) * weight).mean()
+            alike = ssim_map(image[None], target[None], "gaussian_same")[0].mean(0).to(weight)
+            terms["ssim"] = c.ssim_weight * ((1.0 - alike) * weight).mean()
         if self.perceptual is not None and c.lpips_weight and self.iteration % c.lpips_every == 0:
-            part = self._window(view, c.patch_size, Window(0, 0, window.width, window.height), generator)
-            y, x = slice(part.y0, part.y0 + part.height), slice(part.x0, part.x0 + part.width)
-            prediction, truth = (picture[None, :, y, x] * counted[y, x] for picture in (image, target))
+            patch = self._window(c.patch_size, Window(0, 0, window.width, window.height), generator)
+            rows, columns = slice(patch.y0, patch.y0 + patch.height), slice(patch.x0, patch.x0 + patch.width)
+            prediction, truth = ((picture * valid)[None, :, rows, columns] for picture in (image, target))
             distance = self.perceptual(prediction.clamp(0.0, 1.0).contiguous(), truth.contiguous()).mean()
-            terms["perceptual"] = c.lpips_every * c.lpips_weight * trust / c.views_per_step * distance
+            terms["perceptual"] = c.lpips_every * c.lpips_weight * weight[rows, columns].mean() * distance
         if c.opacity_weight:
-            terms["opacity"] = c.opacity_weight / c.views_per_step * gaussians.opacities.mean()
+            terms["opacity"] = c.opacity_weight * gaussians.opacities.mean()
         if c.scale_weight:
             distance = gaussians.means.detach().norm(dim=-1, keepdim=True).clamp_min(1.0)
-            terms["scale"] = c.scale_weight / c.views_per_step * (gaussians.scales / distance).mean()
+            terms["scale"] = c.scale_weight * (gaussians.scales / distance).mean()
         return terms
+
+    def _inverse_depths(self, gaussians: Gaussians, view: int) -> Tensor:
+        """(N,) of the means in a view; 0 behind it."""
+        pose = self.views.cameras.camera_from_world[view]
+        depth = gaussians.means @ pose[2, :3] + pose[2, 3]
+        return torch.where(depth > losses.NEAREST, 1.0 / depth.clamp_min(losses.NEAREST), 0.0)
 
     @torch.no_grad()
     def _move(self, rate: float, generator: torch.Generator) -> None:
@@ -208,7 +227,7 @@ class SplatTrainer:
         self.skipped += 1
         if self.skipped > self.config.max_skipped_steps:
             terms = ", ".join(f"{name}={float(value):g}" for name, value in totals.items())
-            raise ValueError(
+            raise NonFiniteError(
                 f"{self.skipped} training steps up to iteration {self.iteration} had a non-finite loss or gradient "
                 f"({terms}; the last one saw the views {seen}). Check these views' cameras and images, or lower the "
                 "learning rates."

@@ -1,6 +1,7 @@
 """Numerical stress: every routine of the core against a reference, at the inputs where it is worst.
 
-`stress(ROUTINES, cases)` searches; see `routine.Routine` for what a row says and `docs/stress.md` for the results.
+`stress(ROUTINES, cases)` searches; see `routine.Routine` for what a row says and
+`docs/reference/stress.md` for the results.
 """
 
 from cat3d_core.stress import (

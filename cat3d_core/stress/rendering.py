@@ -9,11 +9,15 @@ import torch
 from torch import Tensor
 
 from cat3d_core.rays import Rays
+from cat3d_core.reconstruction.render import normals_from_depth
 from cat3d_core.stress.draw import Draw
 from cat3d_core.stress.routine import ROUNDING, SINGLE, Call, Exact, Reference, Routine, each, zero
-from cat3d_core.zipnerf.field import encode_directions, safe_exp
-from cat3d_core.zipnerf.hash_grid import PRIMES, GridLayout, level_weights, make_layout, query, query_reference
-from cat3d_core.zipnerf.render import Round, expected_depth, normals_from_depth, weights_from_density
+from cat3d_core.zipnerf.field import encode_directions
+from cat3d_core.zipnerf.gradients import safe_exp
+from cat3d_core.zipnerf.grid_layout import PRIMES, GridLayout, make_layout
+from cat3d_core.zipnerf.grid_reference import level_weights, query_reference
+from cat3d_core.zipnerf.hash_grid import query
+from cat3d_core.zipnerf.render import Round, expected_depth, weights_from_density
 
 _BINS = 10
 Query = Callable[[Tensor, Tensor, Tensor, GridLayout], tuple[Tensor, Tensor]]

@@ -41,8 +41,10 @@ def _inputs(draw: Draw, count: int = _COUNT) -> tuple[Tensor, ...]:
 
 
 def _project(means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:
-    inputs = (value.flatten(0, 1) for value in (means, quaternions, scales, opacities))
-    flat = reference.project(*inputs, _camera(means.dtype))
+    camera = _camera(means.dtype)
+    flat = reference.project(
+        means.flatten(0, 1), quaternions.flatten(0, 1), scales.flatten(0, 1), opacities.flatten(), camera
+    )
     return torch.cat([flat.conic, flat.opacity[:, None]], 1).unflatten(0, means.shape[:2])
 
 
@@ -69,19 +71,21 @@ def _colours(count: int, dtype: torch.dtype) -> Tensor:
     return torch.rand((count, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(dtype)
 
 
-def _difference(*inputs: Tensor) -> Tensor:
+def _difference(means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:
     """Largest differences between this machine's rasteriser and the reference in float64 from the same numbers: of the
     image, of the depth relative to the farthest, and of the gradients, relative to the largest."""
     draw = rasterize_cpu.rasterize if rasterize_cpu.available() else reference.rasterize
+    inputs = means, quaternions, scales, opacities
     wide = [value.double().detach().requires_grad_() for value in inputs]
     given = [value.detach().requires_grad_() for value in inputs]
-    colours, camera = _colours(len(inputs[0]), DOUBLE), _camera(DOUBLE)
+    colours, camera = _colours(len(means), DOUBLE), _camera(DOUBLE)
     with torch.enable_grad():
-        exact, margin = reference.rasterize_with_margin(*wide, colours, camera)
-        found = draw(*given, colours.to(inputs[0]), camera.to(dtype=inputs[0].dtype))
+        exact, margin = reference.rasterize_with_margin(wide[0], wide[1], wide[2], wide[3], colours, camera)
+        narrow = colours.to(means), camera.to(dtype=means.dtype)
+        found = draw(given[0], given[1], given[2], given[3], *narrow)
         decided = margin > _DECIDED
         ramp = torch.cos(torch.arange(_SIDE * _SIDE, dtype=DOUBLE)).view(_SIDE, _SIDE) * decided
-        far = inputs[0][:, 2].double().amax()
+        far = means[:, 2].double().amax()
         for raster, tensors in ((exact, wide), (found, given)):
             total = (raster.features.sum(0) * ramp).sum() + (raster.opacity * ramp).sum()
             total = total + (raster.depth * ramp).sum() / far
@@ -95,7 +99,7 @@ def _difference(*inputs: Tensor) -> Tensor:
         assert b.grad is not None
         size = a.grad.abs().amax().clamp_min(1e-6 / a.detach().abs().amax().clamp_min(1e-6))
         errors.append((a.grad - b.grad.double()).abs().amax() / size)
-    return torch.stack([errors[0], torch.stack(errors[1:]).amax()]).to(inputs[0].dtype)
+    return torch.stack([errors[0], torch.stack(errors[1:]).amax()]).to(means.dtype)
 
 
 def _split_inputs(draw: Draw) -> tuple[Tensor, ...]:

@@ -9,11 +9,11 @@ from cat3d_core.stress.draw import Draw
 from cat3d_core.stress.routine import SINGLE, Exact, Routine, each
 from cat3d_core.zipnerf import losses
 from cat3d_core.zipnerf.adam import Adam
-from cat3d_core.zipnerf.config import ReconstructConfig
+from cat3d_core.zipnerf.config import ZipNerfConfig
 from cat3d_core.zipnerf.render import Round
 
 _EPS = 1e-3
-_CONFIG = ReconstructConfig()
+_CONFIG = ZipNerfConfig()
 _HALFWIDTH = 0.02
 _SINGLE_EPS = torch.finfo(torch.float32).eps
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
-class ReconstructConfig:
+class ZipNerfConfig:
     """Robust Zip-NeRF. Defaults are the paper's few-view set-up (CAT3D app. 'Details of 3D Reconstruction').
 
     Lengths are in normalised scene units (mean camera distance about 1). 'Unstated' marks a value that neither CAT3D
@@ -68,6 +68,12 @@ class ReconstructConfig:
     captured_share: float = 0.1
     """Unstated: at least this share of patches and pixels comes from captured views (uniform over views where that
     gives more)."""
+
+    # What is known of depths beforehand
+    depth_prior: float = 0.0
+    """Weight of the loss on inverse depth where views come with depths. CAT3D has none."""
+    depth_prior_until: float = 1.0
+    """Share of the training over which that weight falls linearly to 0: views have the last word."""
 
     # Rays
     near: float = 0.0
@@ -137,6 +143,8 @@ class ReconstructConfig:
             raise ValueError("iterations, batch_rays and chunk_rays are at least 1, samples at least 2 per round.")
         if not 0.0 <= self.patch_share <= 1.0 or not 0.0 <= self.captured_share <= 1.0:
             raise ValueError("patch_share and captured_share lie in [0, 1].")
+        if not (self.depth_prior >= 0.0 and 0.0 <= self.depth_prior_until <= 1.0):
+            raise ValueError("depth_prior is at least 0, and depth_prior_until lies in [0, 1].")
         if not 0.0 < self.lr_final <= self.lr_init:
             raise ValueError("The learning rate falls: 0 < lr_final <= lr_init.")
         if min(self.proposal_every, self.lpips_every, self.plateau_every, self.skip_groups) < 1:
@@ -151,7 +159,7 @@ class ReconstructConfig:
         return len(self.samples)
 
 
-_PAPER = ReconstructConfig()
+_PAPER = ZipNerfConfig()
 
 # For two CPU cores and small images: a scene in seconds (tiny), about a minute or two (fast), or over ten (balanced).
 # One proposal round did as well as two at equal cost on fox (27.3 against 26.6 dB) and fern at 3 views (25.4 against
@@ -178,7 +186,7 @@ _FAST = replace(
     bottleneck_width=16,
 )
 
-PRESETS: dict[str, ReconstructConfig] = {
+PRESETS: dict[str, ZipNerfConfig] = {
     "tiny": replace(
         _FAST, iterations=100, warmup_iterations=10, batch_rays=768, chunk_rays=768,
         samples=(16, 12), grid_max=(64, 128), grid_log2_table=14, multisamples=3,

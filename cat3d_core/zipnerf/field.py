@@ -4,35 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from cat3d_core.random import generator
-from cat3d_core.zipnerf.config import ReconstructConfig
-from cat3d_core.zipnerf.hash_grid import make_layout, query
-
-_LOG_DENSITY_MAX = 40.0  # e^40 * 1e6 is far below the float32 maximum: optical depths stay finite
-
-
-class _SafeExp(torch.autograd.Function):
-    """exp(min(x, 40)) whose gradient beyond the cap is that at the cap, so that no density gets stuck."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        y = x.clamp_max(_LOG_DENSITY_MAX).exp()
-        ctx.save_for_backward(y)
-        return y
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # type: ignore[override]
-        return gradient * ctx.saved_tensors[0]
-
-
-def safe_exp(x: Tensor) -> Tensor:
-    """exp with value and gradient capped at e^40."""
-    return _SafeExp.apply(x)  # type: ignore[no-any-return]
+from cat3d_core.zipnerf.config import ZipNerfConfig
+from cat3d_core.zipnerf.gradients import safe_exp
+from cat3d_core.zipnerf.grid_layout import make_layout
+from cat3d_core.zipnerf.hash_grid import query
 
 
 def encode_directions(unit: Tensor, degree: int) -> Tensor:
@@ -46,7 +26,7 @@ def encode_directions(unit: Tensor, degree: int) -> Tensor:
 class GridDensity(nn.Module):
     """One hash grid and the layers that read it: features of cone samples -> hidden units -> density."""
 
-    def __init__(self, config: ReconstructConfig, round_index: int) -> None:
+    def __init__(self, config: ZipNerfConfig, round_index: int) -> None:
         super().__init__()
         self.gain, self.init, self.bias = config.grid_gain, config.grid_init, config.density_bias
         self.layout = make_layout(
@@ -78,7 +58,7 @@ class GridDensity(nn.Module):
 class ViewColour(nn.Module):
     """Colour of hidden units seen from a direction: bottleneck, directions, a small network, padded sigmoid."""
 
-    def __init__(self, config: ReconstructConfig) -> None:
+    def __init__(self, config: ZipNerfConfig) -> None:
         super().__init__()
         self.degree, self.padding = config.view_degree, config.rgb_padding
         self.bottleneck = nn.Linear(config.density_width, config.bottleneck_width)
@@ -104,7 +84,7 @@ class ViewColour(nn.Module):
 class Field(nn.Module):
     """Proposal densities and the final radiance field of one scene, in normalised scene coordinates."""
 
-    def __init__(self, config: ReconstructConfig, seed: int = 0) -> None:
+    def __init__(self, config: ZipNerfConfig, seed: int = 0) -> None:
         super().__init__()
         self.config = config
         self.grids = nn.ModuleList([GridDensity(config, index) for index in range(config.rounds)])
@@ -120,7 +100,7 @@ class Field(nn.Module):
                     module.bias.zero_()
 
     @classmethod
-    def from_state(cls, config: ReconstructConfig, state: Mapping[str, Tensor]) -> Field:
+    def from_state(cls, config: ZipNerfConfig, state: Mapping[str, Tensor]) -> Field:
         """Field from `Trainer.state()` or its own state dict. Raises ValueError where names or shapes do not fit the
         config."""
         own = {

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from cat3d_core.cpu_library import library, pointer
-from cat3d_core.zipnerf.hash_grid import GridLayout
+from cat3d_core.zipnerf.grid_layout import GridLayout
 
 
 def available() -> bool:
@@ -72,7 +72,7 @@ class _Query(torch.autograd.Function):
 
 
 def query(table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> tuple[Tensor, Tensor]:
-    """As `hash_grid.query_reference` for float32 CPU tensors; deterministic, gradient for the table only.
+    """As `grid_reference.query_reference` for float32 CPU tensors; deterministic, gradient for the table only.
 
     Raises ValueError for shapes that do not fit the layout (the kernel itself checks nothing).
     """

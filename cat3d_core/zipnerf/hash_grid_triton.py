@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cat3d_core.zipnerf.hash_grid import GridLayout
+from cat3d_core.zipnerf.grid_layout import GridLayout
 
 try:
     import triton

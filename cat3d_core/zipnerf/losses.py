@@ -8,13 +8,16 @@ import torch
 from torch import Tensor
 
 from cat3d_core.zipnerf import stepfun
-from cat3d_core.zipnerf.config import ReconstructConfig
+from cat3d_core.zipnerf.config import ZipNerfConfig
 from cat3d_core.zipnerf.coordinates import power_ladder
 from cat3d_core.zipnerf.render import Round
 
+#: z-depth in scene units below which the inverse depth rises no further, so that its gradient stays bounded.
+NEAREST = 0.01
+
 
 class Trust(Protocol):
-    """Settings of `view_weights`, whatever is reconstructed (see ReconstructConfig)."""
+    """Settings of `view_weights`, whatever is reconstructed (see ZipNerfConfig)."""
 
     @property
     def distance_falloff(self) -> float: ...
@@ -45,10 +48,27 @@ def interlevel(proposals: list[Round], final: Round, blur: tuple[float, ...]) ->
     return total
 
 
-def distortion(final: Round, config: ReconstructConfig) -> Tensor:
+def distortion(final: Round, config: ZipNerfConfig) -> Tensor:
     """Mean distortion of the final histograms over power-ladder distance (Zip-NeRF supplement)."""
     t = power_ladder(final.t, config.distortion_power, config.distortion_premult)
     return stepfun.distortion(t, final.weights).mean()
+
+
+def inverse_depth(final: Round, target: Tensor, weight: Tensor) -> Tensor:
+    """Mean over rays of weight (R,) times the Charbonnier distance between the rendered and the known inverse z-depth
+    (R,), in 1 / scene units.
+
+    Rendered is the expectation of 1 / z over where the ray ends; light that passes everything ends at infinity and adds
+    nothing. Inverse depth is what a network that looks at one picture knows best: errors far away count less.
+    """
+    middle = 0.5 * (final.t[:, 1:] + final.t[:, :-1])
+    rendered = (final.weights / middle.clamp_min(NEAREST)).sum(-1)
+    return (weight * charbonnier(rendered - target, 1e-3)).mean()
+
+
+def annealed(weight: float, until: float, progress: float) -> float:
+    """`weight`, falling linearly to 0 at `until` (0: at once) of the training; progress in [0, 1]."""
+    return weight * max(0.0, 1.0 - progress / until) if until > 0 else 0.0
 
 
 def view_weights(centers: Tensor, captured: Tensor, config: Trust, progress: float) -> Tensor:

@@ -6,18 +6,21 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.rays import Rays, image_rays
+from cat3d_core.reconstruction.render import Render, normals_from_depth
+from cat3d_core.uncertainty import ray_entropy
 from cat3d_core.zipnerf import stepfun
-from cat3d_core.zipnerf.config import ReconstructConfig
+from cat3d_core.zipnerf.config import ZipNerfConfig
 from cat3d_core.zipnerf.coordinates import t_from_s
 from cat3d_core.zipnerf.field import Field, GridDensity
 from cat3d_core.zipnerf.frustums import grid_samples
+from cat3d_core.zipnerf.gradients import scale_gradient
 
 
 @dataclass(frozen=True)
@@ -36,19 +39,6 @@ class RayRender:
     rgb: Tensor
     opacity: Tensor
     rounds: list[Round]
-
-
-@dataclass(frozen=True)
-class Render:
-    """A rendered image: image (H, W, 3) in [0, 1]; depth (H, W) median and depth_mean (H, W) expected z-depth in
-    normalised scene units; opacity (H, W) in [0, 1]; normals (H, W, 3) unit, world frame, towards the camera, from the
-    median depth."""
-
-    image: Tensor
-    depth: Tensor
-    depth_mean: Tensor
-    opacity: Tensor
-    normals: Tensor
 
 
 class Part(NamedTuple):
@@ -110,17 +100,6 @@ def query_rays(
     return torch.cat(densities, 1), parts
 
 
-class _ScaleGradient(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, value: Tensor, scale: Tensor) -> Tensor:
-        ctx.save_for_backward(scale)
-        return value.view_as(value)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
-        return gradient * ctx.saved_tensors[0], None
-
-
 def near_gradient_scale(t: Tensor, directions: Tensor) -> Tensor:
     """min(1, distance^2) (R, n) of the middles of intervals with edges t (R, n+1), in scene units: a camera sees what
     is near it with a density of rays that falls with the square of the distance (Philip and Deschaintre 2023)."""
@@ -137,7 +116,7 @@ def composite(
         seen = slice(None) if rows is None else rows
         colour = field.colour(hidden, directions[seen])
         if scale is not None:
-            colour = _ScaleGradient.apply(colour, scale[seen, intervals, None])
+            colour = scale_gradient(colour, scale[seen, intervals, None])
         colours.append(_spread((weights[seen, intervals, None] * colour).sum(1), rows, len(weights)))
     return colours[0] if len(colours) == 1 else torch.stack(colours).sum(0)
 
@@ -148,7 +127,7 @@ def render_rays(
     anneal: float = 1.0,
     generator: torch.Generator | None = None,
     train_proposals: bool = True,
-    config: ReconstructConfig | None = None,
+    config: ZipNerfConfig | None = None,
 ) -> RayRender:
     """Render rays. With a generator (training): jittered samples, random spirals and a random grey background per ray.
 
@@ -174,7 +153,7 @@ def render_rays(
             density, parts = query_rays(field.grids[index], positions, std, lengths, skip, config.skip_groups)  # type: ignore[arg-type]
             if trained and config.near_gradient:
                 scale = near_gradient_scale(t, rays.directions)
-                density = _ScaleGradient.apply(density, scale)
+                density = scale_gradient(density, scale)
             weights = weights_from_density(density, t, rays.directions)
         rounds.append(Round(s, t, weights))
         # The smallest normal number, not 0: a ray without any weight keeps finite logits.
@@ -197,39 +176,12 @@ def expected_depth(final: Round) -> Tensor:
     return torch.where(total > 0, mean.clamp(final.t[:, 0], final.t[:, -1]), final.t[:, -1])
 
 
-def normals_from_depth(depth: Tensor, rays: Rays) -> Tensor:
-    """Unit normals (H, W, 3) in the world, towards the camera, of the surface of z-depth (H, W) seen along its rays
-    (H*W).
-
-    Central differences of the back-projected points, the nearer neighbour at depth edges; 0 where they degenerate.
-    """
-    height, width = depth.shape
-    tiny = torch.finfo(depth.dtype).tiny
-    # Relative to the one camera centre, so that close surfaces do not drown in the rounding of its position.
-    points = (depth.reshape(-1, 1) * rays.directions).reshape(height, width, 3)
-
-    def tangent(axis: int) -> Tensor:
-        step = points.diff(dim=axis)
-        edge = torch.full_like(step.narrow(axis, 0, 1), torch.inf)
-        after, before = torch.cat([step, edge], axis), torch.cat([edge, step], axis)
-        shorter = after.norm(dim=-1, keepdim=True) <= before.norm(dim=-1, keepdim=True)
-        # Of unit length, so that their product neither overflows far away nor underflows close by.
-        return torch.nn.functional.normalize(torch.where(shorter, after, before), dim=-1, eps=tiny)
-
-    if min(height, width) < 2:
-        return torch.zeros_like(points)
-    normal = torch.linalg.cross(tangent(0), tangent(1))
-    normal = normal / normal.norm(dim=-1, keepdim=True).clamp_min(tiny)
-    away = (normal * rays.directions.reshape(height, width, 3)).sum(-1, keepdim=True) > 0
-    return torch.where(away, -normal, normal)
-
-
 @torch.no_grad()
 def render_image(
     field: Field,
     cameras: Cameras,
     view_index: int,
-    config: ReconstructConfig | None = None,
+    config: ZipNerfConfig | None = None,
     resolution_scale: float = 1.0,
     chunk: int = 4096,
     on_progress: Callable[[float], None] | None = None,
@@ -240,18 +192,14 @@ def render_image(
     it raises stops the rendering. `config`: how to sample the rays (samples, multisamples, near, far, background); the
     field's own by default, for example fewer samples for a preview.
     """
-    device = field.colour.rgb.weight.device
     width, height = (max(1, round(float(side) * resolution_scale)) for side in cameras.size[view_index])
     rays = image_rays(cameras, view_index, width, height)
-    rays = Rays(*(part.to(device, torch.float32) for part in rays))
     parts = []
-    for first in range(0, len(rays.origins), chunk):
-        piece = Rays(*(part[first : first + chunk] for part in rays))
-        out = render_rays(field, piece, config=config)
+    for out, share in _render_chunks(field, rays, chunk, config):
         last = out.rounds[-1]
         parts.append((out.rgb, out.opacity, stepfun.quantile(last.t, last.weights, 0.5), expected_depth(last)))
         if on_progress is not None:
-            on_progress(min(1.0, (first + chunk) / len(rays.origins)))
+            on_progress(share)
     rgb, opacity, median, mean = (torch.cat(values) for values in zip(*parts, strict=True))
     depth = median.view(height, width)
     return Render(
@@ -259,15 +207,35 @@ def render_image(
         depth=depth,
         depth_mean=mean.view(height, width),
         opacity=opacity.view(height, width).clamp(0.0, 1.0),
-        normals=normals_from_depth(depth, rays),
+        normals=normals_from_depth(depth, Rays(*(part.to(depth) for part in rays))),
     )
+
+
+def _render_chunks(
+    field: Field, rays: Rays, chunk: int, config: ZipNerfConfig | None = None
+) -> Iterator[tuple[RayRender, float]]:
+    """The rays on the field's device, `chunk` at a time, with the share of them that is done then."""
+    device = field.colour.rgb.weight.device
+    count = len(rays.origins)
+    for first in range(0, count, chunk):
+        piece = Rays(*(part[first : first + chunk].to(device, torch.float32) for part in rays))
+        yield render_rays(field, piece, config=config), min(1.0, (first + chunk) / count)
+
+
+@torch.no_grad()
+def render_uncertainty(field: Field, cameras: Cameras, view_index: int, chunk: int = 4096) -> Tensor:
+    """(H, W) in [0, 1]: entropy of where each ray of the camera ends (see `ray_entropy`)."""
+    width, height = (int(side) for side in cameras.size[view_index])
+    rays = image_rays(cameras, view_index)
+    parts = [ray_entropy(out.rounds[-1].weights) for out, _ in _render_chunks(field, rays, chunk)]
+    return torch.cat(parts).view(height, width)
 
 
 def render_ladder(
     field: Field,
     cameras: Cameras,
     view_index: int,
-    config: ReconstructConfig | None = None,
+    config: ZipNerfConfig | None = None,
     scales: Sequence[float] = (1 / 8, 1 / 4, 1 / 2, 1),
     on_progress: Callable[[float], None] | None = None,
 ) -> Iterator[Render]:

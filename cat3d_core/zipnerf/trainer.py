@@ -13,12 +13,13 @@ from torch import Tensor
 
 from cat3d_core.random import derive_seed
 from cat3d_core.rays import pixel_rays
+from cat3d_core.reconstruction.protocol import NonFiniteError
+from cat3d_core.reconstruction.views import Batch, Views, draw_batch
 from cat3d_core.zipnerf import losses
 from cat3d_core.zipnerf.adam import Adam
-from cat3d_core.zipnerf.config import ReconstructConfig
+from cat3d_core.zipnerf.config import ZipNerfConfig
 from cat3d_core.zipnerf.field import Field
 from cat3d_core.zipnerf.render import render_rays
-from cat3d_core.zipnerf.views import Batch, Views, draw_batch
 
 _KEPT_BYTES = 1 << 30
 
@@ -36,11 +37,6 @@ def _keep_freed_memory() -> None:
 Perceptual = Callable[[Tensor, Tensor], Tensor]
 
 
-class NonFiniteError(ValueError):
-    """Training met more non-finite steps than its config allows; the message names the views and pixels of the last
-    one."""
-
-
 class Trainer:
     """Robust Zip-NeRF training (CAT3D sec. 'Robust 3D reconstruction').
 
@@ -51,7 +47,7 @@ class Trainer:
 
     def __init__(
         self,
-        config: ReconstructConfig,
+        config: ZipNerfConfig,
         views: Views,
         seed: int,
         device: torch.device | str = "cpu",
@@ -162,8 +158,7 @@ class Trainer:
             area = batch.patch**2
             size = max(1, self.config.chunk_rays // area) * area
             for first in range(0, len(batch.view), size):
-                part = slice(first, first + size)
-                piece = Batch(batch.view[part], batch.xy[part], batch.rgb[part], batch.valid[part], batch.patch)
+                piece = batch.part(slice(first, first + size))
                 yield piece, {"rays": len(piece.view) / total, "patches": len(piece.view) / len(batch.view)}
 
     def _losses(
@@ -180,7 +175,7 @@ class Trainer:
         anneal = c.anneal_slope * progress / ((c.anneal_slope - 1.0) * progress + 1.0)
         proposals = self.iteration < c.warmup_iterations or self.iteration % c.proposal_every == 0
         out = render_rays(self.field, rays, anneal, generator, proposals)
-        weight = trust[batch.view] * batch.valid
+        weight = trust[batch.view] * batch.weight
         difference = out.rgb - batch.rgb
         photometric = (losses.charbonnier(difference, c.charbonnier_eps).mean(-1) * weight).mean()
         terms = {
@@ -191,6 +186,10 @@ class Trainer:
         if proposals:
             inter = losses.interlevel(out.rounds[:-1], out.rounds[-1], c.interlevel_blur)
             terms["interlevel"] = c.interlevel_weight * inter * share["rays"]
+        prior = losses.annealed(c.depth_prior, c.depth_prior_until, progress)
+        if prior > 0.0 and batch.inverse_depth is not None and batch.inverse_depth_weight is not None:
+            known = trust[batch.view] * batch.valid * batch.inverse_depth_weight
+            terms["depth"] = prior * losses.inverse_depth(out.rounds[-1], batch.inverse_depth, known) * share["rays"]
         if batch.patch > 1 and self.perceptual is not None:
             shape = (-1, batch.patch, batch.patch, 3)
             valid = batch.valid[:, None]
@@ -198,8 +197,10 @@ class Trainer:
                 (image * valid).view(shape).permute(0, 3, 1, 2).contiguous() for image in (out.rgb, batch.rgb)
             )
             distance = self.perceptual(prediction.clamp(0.0, 1.0), target)
-            mean = (distance * trust[batch.view[:: batch.patch**2]]).mean() * share["patches"]
-            terms["perceptual"] = c.lpips_every * c.lpips_weight * mean
+            trusted = trust[batch.view[:: batch.patch**2]]
+            if views.weight is not None:
+                trusted = trusted * batch.weight.view(-1, batch.patch**2).mean(1)
+            terms["perceptual"] = c.lpips_every * c.lpips_weight * (distance * trusted).mean() * share["patches"]
         return terms
 
     @torch.no_grad()

@@ -19,9 +19,10 @@ from cat3d_core.metrics.depth import depth_errors
 from cat3d_core.metrics.geometry import chamfer_distance
 from cat3d_core.normalization import normalize_scene
 from cat3d_core.random import generator
+from cat3d_core.reconstruction import Views, surface_depth
 from cat3d_core.synthetic import random_cameras, random_scene, trace
 from cat3d_core.synthetic.dataset import surface_points
-from cat3d_core.zipnerf import PRESETS, Field, ReconstructConfig, Trainer, Views, render_image, surface_depth
+from cat3d_core.zipnerf import PRESETS, Field, Trainer, ZipNerfConfig, render_image
 from flows.bench.reconstruct import procedural_views
 from flows.errors import InputError
 from flows.exports.mesh import Mesh, fuse, without_crumbs
@@ -69,9 +70,7 @@ def true_depths(views: Views, family: str, count: int, seed: int) -> list[Tensor
     return list(trace(scene, cameras, supersample=1).depth.float().cpu() * similarity.scale)
 
 
-def depth_row(
-    field: Field, held: Views, truth: list[Tensor], config: ReconstructConfig | None = None
-) -> dict[str, Any]:
+def depth_row(field: Field, held: Views, truth: list[Tensor], config: ZipNerfConfig | None = None) -> dict[str, Any]:
     """Errors of the median depth on the held-out views: all pixels with a surface, and those within RADIUS of it."""
     rendered = [render_image(field, held.cameras, i, config) for i in range(len(held))]
     depth, target = torch.stack([r.depth.cpu() for r in rendered]), torch.stack(truth)

@@ -1,4 +1,4 @@
-"""Accuracy and time of pose estimation against the known cameras of real scenes, as rows for docs/poses.md.
+"""Accuracy and time of pose estimation against the known cameras of real scenes, as rows for docs/explanation/poses.md.
 
     python -m flows.bench.poses DATA [--scenes NAME ...] [--features 4000 ...] [--views all ...] [--out rows.jsonl]
 

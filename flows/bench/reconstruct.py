@@ -15,9 +15,11 @@ import torch
 from torch import Tensor
 
 from cat3d_core.normalization import normalize_scene
+from cat3d_core.reconstruction import Views
 from cat3d_core.synthetic import random_cameras, random_scene, trace
-from cat3d_core.zipnerf import PRESETS, ReconstructConfig, Trainer, Views, hash_grid_cpu, hash_grid_triton, render_image
-from cat3d_core.zipnerf.hash_grid import GridLayout, make_layout, query_reference
+from cat3d_core.zipnerf import PRESETS, Trainer, ZipNerfConfig, hash_grid_cpu, hash_grid_triton, render_image
+from cat3d_core.zipnerf.grid_layout import GridLayout, make_layout
+from cat3d_core.zipnerf.grid_reference import query_reference
 from flows.progress import meter
 
 Times = tuple[float, float]  # wall and processor seconds
@@ -50,13 +52,13 @@ def procedural_views(
     shown = sorted(held)
 
     def views(rows: list[int]) -> Views:
-        return Views(normalised[rows], [images[i] for i in rows], torch.ones(len(rows), dtype=torch.bool))
+        return Views.from_images(normalised[rows], [images[i] for i in rows], torch.ones(len(rows), dtype=torch.bool))
 
     return views(kept), views(shown), [depths[i] for i in shown]
 
 
 def train_and_measure(
-    config: ReconstructConfig, train: Views, test: Views, depths: list[Tensor], device: str = "cpu", seed: int = 0
+    config: ZipNerfConfig, train: Views, test: Views, depths: list[Tensor], device: str = "cpu", seed: int = 0
 ) -> dict[str, float]:
     """Train once: mean held-out PSNR (dB), absolute relative error of the median depth, wall and processor
     seconds, training rays/s."""
@@ -113,20 +115,6 @@ def curves(
                 measured = train_and_measure(dataclasses.replace(base, **change), views, held, depths, device)
                 rows.append(common | measured)
                 progress.advance(note=f"{measured['psnr_db']:.1f} dB")
-    return rows
-
-
-def few_view(
-    preset: str = "fast", family: str = "mip360", counts: Sequence[int] = (3, 6, 9), test: int = 4, size: int = 64
-) -> list[dict[str, Any]]:
-    """Held-out quality from few captured views of a procedural scene."""
-    views, held, depths = procedural_views(family, max(counts) * 3, test, size, size)
-    rows = []
-    for count in counts:
-        keep = [round(i * (len(views) - 1) / (count - 1)) for i in range(count)]
-        images = [views.pixels[int(views.offset[i]) :][: size * size].view(size, size, 3) for i in keep]
-        some = Views(views.cameras[keep], images, views.captured[keep])
-        rows.append({"family": family, "views": count} | train_and_measure(PRESETS[preset], some, held, depths))
     return rows
 
 
@@ -187,7 +175,7 @@ def kernels(
 
 
 def _workload(
-    config: ReconstructConfig, log2_table: int | None, rays: int, repeats: int, device: str, bandwidth: float
+    config: ZipNerfConfig, log2_table: int | None, rays: int, repeats: int, device: str, bandwidth: float
 ) -> list[dict[str, Any]]:
     generator = torch.Generator().manual_seed(0)
     log2_table = log2_table or config.grid_log2_table

@@ -95,7 +95,8 @@ def sampler_rows(quick: bool, data: Path | None) -> list[Row]:
     if not quick:
         with contextlib.suppress(MissingError):
             rows += sampler.rows(_model_file(), steps)
-    bounds = tuple(math.copysign(math.inf, i - 0.5) if b is None else b for i, b in enumerate(GUIDANCE_INTERVAL))
+    low, high = GUIDANCE_INTERVAL
+    bounds = (-math.inf if low is None else low, math.inf if high is None else high)
     interval = next(name for name, found in sampler.INTERVALS.items() if found == bounds)
     return _marked(rows, chosen | {"interval": interval, "problem": "mixture"})  # a model's file has its own default
 

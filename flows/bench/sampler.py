@@ -21,7 +21,7 @@ from cat3d_core.diffusion import SIZES, GuidanceConfig, MultiViewModel, SamplerC
 from cat3d_core.diffusion.config import ModelConfig
 from cat3d_core.diffusion.sampler import evaluations
 from cat3d_core.diffusion.schedule import Nodes, alpha_sigma
-from cat3d_core.diffusion.solvers import SolverName
+from cat3d_core.diffusion.solvers import SOLVERS
 from cat3d_core.random import generator
 
 # Log-SNR intervals of guidance: everywhere, without the cleanest part, and without the noisiest part too.
@@ -126,7 +126,7 @@ def rows(
         model.unet.to(dtype)
         for interval, (low, high) in INTERVALS.items():
             guidance = GuidanceConfig(3.0, low, high)
-            for solver in get_args(SolverName):
+            for solver in SOLVERS:
                 for nodes in get_args(Nodes):
                     for count in steps:
                         config = SamplerConfig(solver, nodes, count, guidance)
@@ -181,7 +181,7 @@ def plot(result: list[dict[str, Any]], path: Path) -> None:
     axes = figure.subplots(1, len(INTERVALS), sharey=True)
     markers = dict(zip(get_args(Nodes), "osv^", strict=True))
     for axis, interval in zip(axes, INTERVALS, strict=True):
-        for color, solver in enumerate(get_args(SolverName)):
+        for color, solver in enumerate(SOLVERS):
             for nodes, marker in markers.items():
                 line = [
                     r

@@ -1,6 +1,7 @@
 """Benchmark of the fan-out: speed-up and overhead of worker processes and of a Dask cluster, costs of the parts.
 
-`python -m flows.bench.sampling WORK [--model FILE] [--groups 24]` prints what `docs/scaling.md` calculates with.
+`python -m flows.bench.sampling WORK [--model FILE] [--groups 24]` prints what
+`docs/explanation/scaling.md` calculates with.
   share    wall time, workers' busy seconds, overhead = workers * wall / busy - 1, of sampling real groups, by executor
   batch    seconds a batch costs apart from its groups: handed groups that are done already, a worker only looks
   store    operations per second on the store: latents written, marks written, marks read
@@ -18,13 +19,13 @@ from typing import Any
 import numpy as np
 
 from flows.commands.run import make_config
-from flows.pipeline.jobs import Job, expected_steps, make_jobs, pending
-from flows.pipeline.scene import ensure_store, execute_stage, prepare_run
+from flows.jobs.job import Job, Request
+from flows.pipeline.runner import opened, run_missing
 from flows.pipeline.server import prefect_server
 from flows.stages.sample import sample_work
 from flows.workers.executors import open_executor
 from flows.workers.fan_out import fan_out
-from flows.workers.work import Batch, is_done
+from flows.workers.work import is_done
 from schemas.scene_store import SceneStore
 
 SOURCE = "procedural:dtu/3?views=9&width=64&height=64"
@@ -33,13 +34,10 @@ SOURCE = "procedural:dtu/3?views=9&width=64&height=64"
 def prepared(work: Path, model: Path | None, groups: int) -> Job:
     """A job whose store is ready to be sampled: 5 views a group."""
     settings = [f"plan.views={5 * groups}", "method=cat3d", *([f"sample.checkpoint={model}"] if model else [])]
-    job = make_jobs(SOURCE, work, ["3"], make_config({}, None, settings))[1][0]
-    capture = job.capture()
-    ensure_store(job, capture)
-    prepare_run(job, capture)
-    for step in pending(job, expected_steps(job, capture)):
-        if step.stage in ("ingest", "poses", "plan", "encode"):
-            execute_stage(job, step)
+    job = Request(SOURCE, work, ("3",), make_config({}, None, settings)).jobs()[0]
+    with opened(job):
+        for stage in ("plan", "encode"):
+            run_missing(job, until=stage)
     return job
 
 
@@ -69,13 +67,14 @@ def share_row(job: Job, executor: str, workers: int) -> dict[str, Any]:
 def batch_row(job: Job, executor: str, count: int = 40) -> dict[str, Any]:
     """Hand out batches of one group that is done already, one after another; the store must be sampled."""
     job = with_execution(job, executor=executor, workers=1)
+    work = sample_work(job, SceneStore.open(job.store_path, "r+"), "0" * 64)
     started = time.monotonic()
     open_one = open_executor(job.config.execution, job.out / ".work")
     try:
         times: list[float] = []
         for number in range(count):
             sent = time.monotonic()
-            open_one.submit(Batch(number=number, job=job, stage="sample", key="0" * 64, items=(0,)))
+            open_one.submit(work.batch(number, (0,)))
             while not (answers := open_one.answers(60)):
                 pass
             answers[0].raise_error()

@@ -11,7 +11,8 @@ import torch
 from cat3d_core.cameras import Cameras
 from cat3d_core.metrics.protocols import evaluate
 from cat3d_core.normalization import normalize_scene
-from cat3d_core.zipnerf import ReconstructConfig, Trainer, Views, render_image
+from cat3d_core.reconstruction import Views
+from cat3d_core.zipnerf import Trainer, ZipNerfConfig, render_image
 from flows.errors import InputError
 from flows.readers import read_capture
 from flows.stages.ingest import ingest_view
@@ -40,12 +41,14 @@ def scene_views(folder: Path, split: str, downscale: int) -> tuple[Views, Views]
             assert seen.intrinsics is not None
             cameras.append(Cameras(seen.intrinsics[None], pose, torch.tensor([[width, height]])))
             images.append(torch.from_numpy(seen.image))
-        return Views(similarity.cameras(Cameras.cat(cameras)), images, torch.ones(len(rows), dtype=torch.bool))
+        return Views.from_images(
+            similarity.cameras(Cameras.cat(cameras)), images, torch.ones(len(rows), dtype=torch.bool)
+        )
 
     return views(capture.splits[split]["train"]), views(capture.splits[split]["test"])
 
 
-def row(folder: Path, split: str, config: ReconstructConfig, downscale: int, seed: int = 0) -> dict[str, Any]:
+def row(folder: Path, split: str, config: ZipNerfConfig, downscale: int, seed: int = 0) -> dict[str, Any]:
     """Train once: mean PSNR (dB) and SSIM over the held-out views, seconds of training and of a rendered view."""
     train, held = scene_views(folder, split, downscale)
     trainer = Trainer(config, train, seed)

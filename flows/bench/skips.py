@@ -18,16 +18,17 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from flows.commands.run import make_config
-from flows.pipeline.jobs import Job, Step, expected_steps, make_jobs, pending
-from flows.pipeline.locks import writing
-from flows.pipeline.scene import ensure_store, execute_stage, prepare_run
+from flows.jobs.job import Job, Request
+from flows.pipeline.keys import Step, stages_of
+from flows.pipeline.runner import execute_stage, opened, run_missing
 from flows.readers import read_capture
+from flows.reconstruction.stored import Checkpoint
 from flows.reporting.report import write_report
 from flows.reporting.summary import number, summary_rows
-from flows.stages.reconstruct import Checkpoint
 from schemas.layout import LAYOUT, SCENE_STAGES
 from schemas.scene_store import SceneStore
 from schemas.skip import SkipConfig
+from schemas.stages import StageRecord
 
 FOLDER = Path("outputs/skips")
 START, END = "<!-- tables: written by python -m flows.bench.skips -->", "<!-- end of tables -->"
@@ -92,7 +93,7 @@ def make_job(source: str, variant: str, settings: Sequence[str], folder: Path) -
     """A run with three training views, named after its variant."""
     switches = ", ".join(f"{name}: {str(on).lower()}" for name, on in VARIANTS[variant].items())
     texts = [*settings, f"skip={{{switches}}}", f"label={variant.replace(' ', '-')}"]
-    return make_jobs(source, folder.resolve(), ["3"], make_config({}, None, texts))[1][0]
+    return Request(source, folder.resolve(), ("3",), make_config({}, None, texts)).jobs()[0]
 
 
 def run_row(job: Job) -> dict[str, Any]:
@@ -101,19 +102,10 @@ def run_row(job: Job) -> dict[str, Any]:
     seconds: of all its stages; cpu_seconds: of this process and its workers, which other jobs on the machine don't
     lengthen. evaluations: of the diffusion network. generated: views that were sampled.
     """
-    capture = job.capture()
-    with writing(job.store_path, job.scene_id):
-        ensure_store(job, capture)
-        prepare_run(job, capture)
-        store = SceneStore.open(job.store_path, "r+")
-        for step in pending(job, expected_steps(job, capture)):
-            if linked(store, job, step):
-                continue
-            Checkpoint(job, step.key).remove()  # a measured stage is done in one go
-            started = cpu_seconds()
-            execute_stage(job, step)
-            note(store, job, step.stage, cpu_seconds() - started)
-    records = {stage: store.record(stage, job.run) for stage in job.stages}
+    with opened(job):
+        run_missing(job, execute=measure)
+    store = SceneStore.open(job.store_path)
+    records = {stage.name: store.record(stage.name, job.run) for stage in stages_of(job)}
     spent = store.attrs["cpu_seconds"]
     found = [r for r in summary_rows(job.out, job.scene_id) if r["run"] == job.run][0]
     done = {stage: record for stage, record in records.items() if record is not None}
@@ -128,6 +120,18 @@ def run_row(job: Job) -> dict[str, Any]:
         "steps": int(done["reconstruct"].work["steps"]),
         **{name: found[name] for name in ("psnr_db", "ssim", "lpips")},
     }
+
+
+def measure(job: Job, step: Step) -> StageRecord:
+    """Do a stage and note its CPU time, or take its result from another run."""
+    store = SceneStore.open(job.store_path, "r+")
+    record = linked(store, job, step)
+    if record is None:
+        Checkpoint(job, step.key).remove()  # a measured stage is done in one go
+        started = cpu_seconds()
+        record = execute_stage(job, step)
+        note(store, job, step.stage, cpu_seconds() - started)
+    return record
 
 
 def owner(job: Job, stage: str) -> str:
@@ -145,10 +149,10 @@ def cpu_seconds() -> float:
     return sum(u.ru_utime + u.ru_stime for u in usage)
 
 
-def linked(store: SceneStore, job: Job, step: Step) -> bool:
-    """Take the stage's result from another run that has one with the same key, if there is one."""
+def linked(store: SceneStore, job: Job, step: Step) -> StageRecord | None:
+    """Take the stage's result from another run that has one with the same key; its record, None if there is none."""
     if step.stage in SCENE_STAGES or step.stage == "evaluate":  # rows of metrics carry the run's name
-        return False
+        return None
     for name in store.runs():
         record = store.record(step.stage, name)
         if name == job.run or record is None or record.key != step.key:
@@ -160,8 +164,8 @@ def linked(store: SceneStore, job: Job, step: Step) -> bool:
                 link_arrays(store.folder / "runs" / name, store.folder / "runs" / job.run, spec.path.split("/", 2)[2])
         store.complete(step.stage, record, job.run)
         note(store, job, step.stage, store.attrs["cpu_seconds"][f"{name}/{step.stage}"])
-        return True
-    return False
+        return record
+    return None
 
 
 def link_arrays(source: Path, target: Path, pattern: str) -> None:
@@ -253,4 +257,4 @@ def write_tables(page: Path, table: Path) -> None:
 
 
 if __name__ == "__main__":
-    write_tables(Path("docs/skips.md"), Path("docs/benchmarks/skips.parquet"))
+    write_tables(Path("docs/explanation/skips.md"), Path("docs/reference/benchmarks/skips.parquet"))

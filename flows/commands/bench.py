@@ -30,7 +30,7 @@ TABLES = "benchmarks"
 
 def bench_command(name: str, quick: bool, data: Path | None, out: Path | None) -> int:
     """Run one benchmark or `all`; rows to `out/benchmarks/<name>.parquet`, the page to `out/benchmarks.md`. Without a
-    name, list them. `out` None: docs when run in the checkout, else outputs. Returns the number of benchmarks that
+    name, list them. `out` None: docs/reference in a checkout, else outputs. Returns the number of benchmarks that
     failed. One of several that lacks its data is left out, and its earlier rows stay on the page. Raises InputError for
     an unknown name."""
     if not name:
@@ -42,7 +42,7 @@ def bench_command(name: str, quick: bool, data: Path | None, out: Path | None) -
     if data is not None and not data.is_dir():
         raise InputError(f"{data} is not a folder; --data takes the folder that holds the real scenes.")
     checkout = Path(cat3d_core.__file__).resolve().parents[1]
-    out = out or Path("docs" if Path.cwd() == checkout else "outputs")
+    out = out or Path("docs/reference" if Path.cwd() == checkout else "outputs")
     failed = 0
     for one in BENCHES if name == "all" else (name,):
         try:

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from cat3d_core.random import generator
-from cat3d_core.zipnerf import PointCloud, point_cloud, surface_depth
+from cat3d_core.reconstruction import PointCloud, point_cloud, surface_depth
 from flows.errors import InputError
 from flows.exports.dataset import write_dataset
 from flows.exports.mesh import fuse, import_open3d, without_crumbs, write_mesh_glb, write_mesh_ply

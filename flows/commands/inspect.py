@@ -8,7 +8,9 @@ from pathlib import Path
 import typer
 
 from flows.errors import InputError
-from flows.pipeline.jobs import Job, capture_digests, expected_steps
+from flows.jobs.job import Job
+from flows.jobs.scene import Scene
+from flows.pipeline.keys import expected_steps
 from flows.progress import console
 from flows.reporting.inspect import as_text, inspect_store
 from schemas.layout import SCENE_STAGES
@@ -34,17 +36,14 @@ def expected_keys(path: Path) -> tuple[dict[tuple[str | None, str], set[str]] | 
     and a remark where the source can't be read any more, so that nothing can be said about staleness."""
     store = SceneStore.open(path)
     expected: dict[tuple[str | None, str], set[str]] = {}
-    digests: dict[str, dict] = {}
+    scenes: dict[Scene, Scene] = {}
     for name in store.runs():
         document = store.run(name).attrs.get("job")
         if document is None:
             continue
         job = Job.model_validate(document)
         try:
-            capture = job.capture()
-            if job.source not in digests:
-                digests[job.source] = capture_digests(capture)
-            steps = expected_steps(job, capture, digests[job.source])
+            steps = expected_steps(job.sharing(scenes.setdefault(job.scene, job.scene)))
         except InputError as error:
             return None, f"Whether stages are stale is unknown, since the source can't be read: {error}"
         for stage, step in steps.items():

@@ -7,15 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from flows.commands.run import make_config
-from flows.pipeline.jobs import Job, capture_digests, expected_steps, make_jobs, pending
-from flows.pipeline.locks import writing
-from flows.pipeline.scene import ensure_store, execute_stage, prepare_run
+from flows.jobs.job import Job, Request
+from flows.pipeline.runner import opened, run_missing
 from flows.progress import console
 from flows.reporting.plan_drawing import plan_table
 from flows.stages.plan import plan_run
 from schemas.scene_store import SceneStore
-
-STAGES = ("ingest", "poses", "plan")
 
 
 def plan_command(
@@ -35,15 +32,11 @@ def plan_command(
     """
     config = make_config(given | {"method": "cat3d"}, config_file, settings)
     with console.status(f"Reading {source}"):
-        capture, jobs = make_jobs(source, out.resolve(), [v.strip() for v in views], config, reader, image_folder)
-        digests = capture_digests(capture)
-    with writing(jobs[0].store_path, capture.scene_id):
-        ensure_store(jobs[0], capture)
+        request = Request(source, out.resolve(), tuple(v.strip() for v in views), config, reader, image_folder)
+        jobs = request.jobs()
+    with opened(jobs[0]):
         for job in jobs:
-            prepare_run(job, capture)
-            for step in pending(job, expected_steps(job, capture, digests)):
-                if step.stage in STAGES:
-                    execute_stage(job, step)
+            run_missing(job, until="plan")
     for job in jobs:
         show_plan(job, rows)
     return jobs

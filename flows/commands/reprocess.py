@@ -13,18 +13,20 @@ import shutil
 import statistics
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from rich.table import Table
 
 from flows.errors import InputError
-from flows.pipeline.jobs import Job, Step, capture_digests, expected_steps, pending
+from flows.jobs.job import Job
+from flows.jobs.scene import Scene
+from flows.pipeline.keys import Step, downstream, expected_steps, pending
 from flows.progress import console
-from flows.readers.base import Capture
 from flows.reporting.summary import timing_rows
 from schemas.errors import StoreError
-from schemas.layout import SCENE_STAGES, downstream
+from schemas.layout import SCENE_STAGES
 from schemas.scene_store import SceneStore
 
 FILTERS = ("scene", "dataset", "method", "run", "seed")
@@ -67,7 +69,7 @@ def find_stale(
     for path in sorted(out.glob("*.zarr")):
         store = SceneStore.open(clone_path(path) if clone_path(path).exists() else path)
         runs: dict[str, tuple[Job, list[Step]]] = {}
-        captures: dict[str, tuple[Capture, dict]] = {}
+        scenes: dict[Scene, Scene] = {}
         for name in store.runs():
             document = store.run(name).attrs.get("job")
             if document is None:
@@ -81,10 +83,8 @@ def find_stale(
             if not wanted or (split is not None and job.config.split != split):
                 continue
             try:
-                if job.source not in captures:
-                    capture = job.capture()
-                    captures[job.source] = (capture, capture_digests(capture))
-                steps = expected_steps(job, *captures[job.source])
+                job = job.sharing(scenes.setdefault(job.scene, job.scene))
+                steps = expected_steps(job)
             except InputError as error:
                 problems.append(f"{job.scene_id}: {error}")
                 continue
@@ -93,8 +93,7 @@ def find_stale(
             if from_stage:
                 asked = [s for s in downstream(from_stage) if s in steps]
                 known = {s.stage for s in stale}
-                extra = [steps[s] for s in asked if s not in known]
-                stale += [Step(s.stage, s.key, s.inputs, s.config, s.version, "asked for by --from") for s in extra]
+                stale += [replace(steps[s], why="asked for by --from") for s in asked if s not in known]
                 stale.sort(key=lambda s: list(steps).index(s.stage))
             if stale:
                 runs[name] = (job, stale)

@@ -6,12 +6,10 @@ from pathlib import Path
 
 from rich.table import Table
 
+from cat3d_core.metrics import measures
 from flows.errors import InputError
 from flows.progress import console
-from flows.reporting.summary import number, summary_rows
-
-#: What counts as worse, per metric: (name, sign of better, unit).
-COMPARED = (("psnr_db", 1, "dB"), ("ssim", 1, ""), ("lpips", -1, ""))
+from flows.reporting.summary import measured, number, shown_metrics, summary_rows, title
 
 
 def results_command(out: Path, against: Path | None, bound_db: float, bound_rest: float) -> int:
@@ -19,10 +17,11 @@ def results_command(out: Path, against: Path | None, bound_db: float, bound_rest
     rows = summary_rows(out)
     if not rows:
         raise InputError(f"{out} holds no metrics; give the --out folder of a run or sweep.")
-    table = Table("scene", "run", "protocol", "PSNR (dB)", "SSIM", "LPIPS", "backbone", "seconds", title=str(out))
+    shown = shown_metrics(rows)
+    table = Table("scene", "run", "protocol", *map(title, shown), "seconds", title=str(out))
     for r in rows:
-        table.add_row(r["scene_id"], r["run"], r["protocol"], number(r["psnr_db"], 2), number(r["ssim"], 4),
-                      number(r["lpips"], 4), r["backbone"], number(r["seconds"], 0))  # fmt: skip
+        numbers = [*(measured(r, metric) for metric in shown), number(r["seconds"], 0)]
+        table.add_row(r["scene_id"], r["run"], r["protocol"], *numbers)
     console.print(table)
     return compare(out, against, bound_db, bound_rest) if against else 0
 
@@ -38,16 +37,18 @@ def compare(out: Path, against: Path, bound_db: float, bound_rest: float) -> int
         before = old.get((r["scene_id"], r["run"], r["protocol"]))
         if before is None:
             continue
-        for name, sign, _ in COMPARED:
+        for metric in measures.METRICS:
+            name = metric.name
             if r[name] is None or before[name] is None:
                 continue
-            if name == "lpips" and r["backbone"] != before["backbone"]:
-                continue  # distances of two networks are not comparable
+            if metric.network is not None and r[metric.network.column] != before[metric.network.column]:
+                continue  # numbers of two networks are not comparable
             compared += 1
             change = 0.0 if r[name] == before[name] else r[name] - before[name]
-            worse = -sign * change > (bound_db if name == "psnr_db" else bound_rest)
+            decline = -change if metric.better == "higher" else change
+            worse = decline > (bound_db if metric.unit == "dB" else bound_rest)
             regressions += worse
-            digits = 2 if name == "psnr_db" else 4
+            digits = metric.digits if metric.unit == "dB" else metric.digits + 1  # changes are smaller than numbers
             values = (number(before[name], digits), number(r[name], digits), f"{change:+.{digits}f}")
             table.add_row(r["scene_id"], r["run"], r["protocol"], name, *values, "[red]worse[/red]" if worse else "")
     console.print(table)

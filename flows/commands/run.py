@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from flows.pipeline.jobs import Job, capture_digests, expected_steps, make_jobs, pending
+from flows.jobs.job import Job, Request
+from flows.pipeline.keys import pending
 from flows.progress import console
 from schemas.config import RunConfig, load_config, parse_config
 from schemas.settings import merged, set_at, settings_document, value_at
@@ -39,9 +40,10 @@ def run_command(
     started = time.monotonic()
     config = make_config(given, config_file, settings)
     with console.status(f"Reading {source}"):
-        capture, jobs = make_jobs(source, out.resolve(), [v.strip() for v in views], config, reader, image_folder)
-        digests = capture_digests(capture)
-        todo = {job.run: pending(job, expected_steps(job, capture, digests)) for job in jobs}
+        request = Request(source, out.resolve(), tuple(v.strip() for v in views), config, reader, image_folder)
+        jobs = request.jobs()
+        capture = jobs[0].capture()
+        todo = {job.run: pending(job) for job in jobs}
     console.print(f"{capture.scene_id}: {len(capture)} views ({capture.dataset})")
     for job in jobs:
         steps = todo[job.run]
@@ -55,7 +57,7 @@ def run_command(
         with prefect_server(out.resolve() / ".prefect"):
             from flows.pipeline.scene import scene_flow
 
-            scene_flow(capture.scene_id, [job.model_dump(mode="json") for job in jobs])
+            scene_flow(capture.scene_id, jobs)
     from flows.reporting.report import write_report
     from flows.reporting.summary import print_metrics
 

@@ -1,20 +1,20 @@
-"""A finished run as the exports read it: its field, its cameras, its views, and the frame of what is written."""
+"""A finished run as the exports read it: its reconstruction, cameras and views, and the frame of what is written."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.normalization import Similarity
-from cat3d_core.zipnerf import Field, ReconstructConfig, Render, render_image
+from cat3d_core.reconstruction import Reconstructor, Render
 from flows.errors import InputError
+from flows.jobs.access import read_cameras, read_images, read_similarity, views_with_role
 from flows.progress import meter
-from flows.stages.common import read_cameras, read_images, read_similarity, views_with_role
+from flows.reconstruction.stored import read_reconstruction
 from flows.stages.training_views import generated_views
 from schemas.scene_store import Run, SceneStore
 
@@ -29,7 +29,7 @@ class Source:
 
     store: SceneStore
     run: Run
-    field: Field
+    scene: Reconstructor
     frame_from_scene: Similarity
 
 
@@ -45,28 +45,7 @@ def open_source(path: Path, run_name: str | None, frame: str) -> Source:
         raise InputError(f"{path} cannot be exported as it is: {known}.")
     run = store.run(run_name or names[0])
     frame_from_scene = read_similarity(store).inverse() if frame == "world" else IDENTITY
-    return Source(store, run, _read_field(store, run), frame_from_scene)
-
-
-def _read_field(store: SceneStore, run: Run) -> Field:
-    """The field with the settings it was trained with, which need not be those of today's presets."""
-    record = store.record("reconstruct", run.name)
-    if record is None:
-        raise InputError(
-            f"The run {run.name} of {store.folder} has no finished field; finish it with `cat3d run` first."
-        )
-    settings = record.inputs["trainer"]
-    state = {name: torch.from_numpy(run.field.read(name)) for name in run.field.attrs["parameters"]}
-    try:
-        values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
-        config = ReconstructConfig(**values)
-        field = Field.from_state(config, state)
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"The field of {run.name} in {store.folder} was trained by another version of cat3d and cannot be read "
-            f"({error}); reconstruct it again with `cat3d reprocess`."
-        ) from None
-    return field.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+    return Source(store, run, read_reconstruction(store, run), frame_from_scene)
 
 
 @dataclass(frozen=True)
@@ -110,6 +89,6 @@ def render_views(source: Source, cameras: Cameras, scale: float = 1.0) -> Iterat
     """Render each camera (scene frame) at `scale` times its size; tensors on the CPU, one view at a time."""
     with meter(f"render {source.store.scene_id} {source.run.name}", len(cameras)) as progress:
         for index in range(len(cameras)):
-            render = render_image(source.field, cameras.to(dtype=torch.float32), index, resolution_scale=scale)
+            render = source.scene.render(cameras, index, scale)
             yield Render(**{name: value.cpu() for name, value in vars(render).items()})
             progress.advance()

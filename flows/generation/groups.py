@@ -15,7 +15,7 @@ from cat3d_core.random import normal
 from cat3d_core.rays import raymap
 from cat3d_core.sample_sets import KINDS, sample_cameras
 from cat3d_core.view_selection import pose_distance
-from flows.stages.common import read_cameras
+from flows.jobs.access import read_cameras
 from schemas.content_key import content_key
 from schemas.scene_store import Run, SceneStore
 

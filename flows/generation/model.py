@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,8 @@ from cat3d_core.diffusion import GuidanceConfig, MultiViewModel, SamplerConfig, 
 from cat3d_core.diffusion.config import ModelConfig, from_dict
 from cat3d_core.weights import default_model_path
 from flows.errors import InputError
-from flows.pipeline.jobs import Job
+from flows.jobs.device import device, free_device_memory
+from flows.jobs.job import Job
 
 #: On the front of `cat3d bench sampler`: the fewest steps whose error, on problems with a known answer, is within that
 #: of the paper's sampler.
@@ -83,13 +82,7 @@ def _loaded(path: Path, _changed: int, where: str, precision: str) -> MultiViewM
 def forget_model() -> None:
     """Free the memory of this process's model."""
     _loaded.cache_clear()
-    if torch.cuda.is_available():
-        torch.cuda.empty_cache()
-
-
-def device() -> str:
-    """This process's device. A worker sees one GPU only, see `local.py` and `dask_executor.py` here."""
-    return "cuda" if torch.cuda.is_available() else "cpu"
+    free_device_memory()
 
 
 def sampler_settings(job: Job) -> dict[str, Any]:
@@ -107,17 +100,6 @@ def sampler_settings(job: Job) -> dict[str, Any]:
     limited = skip.guidance and chosen["guidance"] != 1
     interval = settings.guidance_log_snr or GUIDANCE_INTERVAL if limited else (None, None)
     return chosen | {"guidance_log_snr": list(interval), "near_steps": skip.near_steps}
-
-
-@contextlib.contextmanager
-def cpu_threads(count: int) -> Iterator[None]:
-    """PyTorch with this many CPU threads: the same number in every process, as it may decide how sums are split."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def sampler_config(job: Job) -> SamplerConfig:

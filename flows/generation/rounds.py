@@ -14,18 +14,19 @@ import numpy as np
 import torch
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.rays import Rays, image_rays
-from cat3d_core.uncertainty import ray_entropy, unseen
+from cat3d_core.rays import image_rays
+from cat3d_core.reconstruction import Reconstructor, Views
+from cat3d_core.uncertainty import unseen
 from cat3d_core.view_selection import pose_distance
-from cat3d_core.zipnerf import Field, Views, stepfun
-from cat3d_core.zipnerf.render import render_rays
-from flows.generation.brief import brief_field, brief_render
+from flows.generation.brief import brief_reconstruction, brief_render
 from flows.generation.groups import StoredPlan
-from flows.generation.model import device, shared_model
+from flows.generation.model import shared_model
+from flows.jobs.access import read_cameras, read_images, views_with_role
+from flows.jobs.job import Job
 from flows.media.images import resize
-from flows.pipeline.jobs import Job
-from flows.stages.common import read_cameras, read_images, views_with_role
 from flows.stages.decode import decoded
+from schemas.decisions import chosen as decided
+from schemas.decisions import skipped
 from schemas.scene_store import SceneStore
 
 #: Share of the plan's groups in a round, and the least gain in PSNR of the held-out view that is worth another one.
@@ -43,7 +44,8 @@ class OneRound:
     def __init__(self, plan: StoredPlan) -> None:
         self.passes = plan.passes()
         self.kept = [g for items in self.passes for g in items]
-        self.decisions = [] if plan.needed else ["Sampled nothing: captured views cover the path."]
+        none = skipped("Sampled nothing: captured views cover the path.", "covered_path", views=len(plan))
+        self.decisions = [] if plan.needed else [none]
 
     def __iter__(self) -> Iterator[list[list[int]]]:
         yield self.passes
@@ -61,40 +63,40 @@ class Rounds(OneRound):
     def __iter__(self) -> Iterator[list[list[int]]]:
         if len(self.train) < 2 or not self.passes:
             if self.passes:
-                self.decisions.append("Sampled in one round: of one captured view none can be held out.")
+                self.decisions.append(decided("Sampled in one round: of one captured view none can be held out."))
             yield self.passes
             return
         if (1 - SHARE) * self.flops < BRIEF_FIELDS * BRIEF_FLOPS:
-            self.decisions.append(
-                "Sampled in one round: all groups cost less than the brief reconstructions that choosing takes."
-            )
+            text = "Sampled in one round: all groups cost less than the brief reconstructions that choosing takes."
+            self.decisions.append(decided(text))
             yield self.passes
             return
         *anchors, rest = self.passes
         size = math.ceil(SHARE * len(rest))
         chosen = [rest[i] for i in np.unique(np.linspace(0, len(rest) - 1, size).round().astype(int))]
-        self.kept, before, number = [], self.held_out_psnr(self.brief_field([])), 0
+        self.kept, before, number = [], self.held_out_psnr(self.brief([])), 0
         while chosen:
             yield [*anchors, chosen]
             number += 1
             sampled = [*self.kept, *(g for items in anchors for g in items), *chosen]
-            field = self.brief_field(sampled)
-            after = self.held_out_psnr(field)
+            brief = self.brief(sampled)
+            after = self.held_out_psnr(brief)
             told = f"Round {number}: with {len(chosen)} more groups the held-out captured view went from "
             told += f"{before:.2f} dB to {after:.2f} dB"
             if after >= before:
                 self.kept = sampled
             if after - before < GAIN_DB:
                 used = "" if after >= before else "; its views are not used"
-                self.decisions.append(f"{told}, which is less than {GAIN_DB:g} dB more{used}.")
+                self.decisions.append(decided(f"{told}, which is less than {GAIN_DB:g} dB more{used}."))
                 break
-            self.decisions.append(f"{told}.")
+            self.decisions.append(decided(f"{told}."))
             left = [g for g in rest if g not in self.kept]
-            unknown = {g: self.unknown(field, g) for g in left}
+            unknown = {g: self.unknown(brief, g) for g in left}
             chosen = sorted(sorted(left, key=lambda g: (-unknown[g], g))[:size])
             anchors, before = [], after
         count = sum(map(len, self.passes))
-        self.decisions.append(f"{len(self.kept)} of {count} groups are used, chosen for this scene in {number} rounds.")
+        text = f"{len(self.kept)} of {count} groups are used, chosen for this scene in {number} rounds."
+        self.decisions.append(skipped(text, "rounds", groups=count - len(self.kept)))
 
     @property
     def held_out(self) -> int:
@@ -114,28 +116,28 @@ class Rounds(OneRound):
             image = decoded(model, run.generated, view)[0, y0 : y0 + height, x0 : x0 + width]
             cameras = Cameras.cat([cameras, self.plan.cameras[view].crop(x0, y0, width, height)])
             images.append(torch.from_numpy(np.ascontiguousarray(image)))
-        return Views(cameras, images, torch.arange(len(cameras)) < len(shown))
+        return Views.from_images(cameras, images, torch.arange(len(cameras)) < len(shown))
 
-    def brief_field(self, groups: list[int]) -> Field:
-        """Of the captured views but the held-out one and the views of the groups."""
-        return brief_field(self.views(groups), self.job.config.seed, self.job.config.execution.threads)
+    def brief(self, groups: list[int]) -> Reconstructor:
+        """A brief reconstruction of the captured views but the held-out one, and of the views of the groups."""
+        return brief_reconstruction(self.job, self.views(groups))
 
-    def held_out_psnr(self, field: Field) -> float:
+    def held_out_psnr(self, brief: Reconstructor) -> float:
         """PSNR in dB of the held-out captured view, as `brief_render` shows it."""
-        camera = read_cameras(self.store.captured, [self.held_out]).to(dtype=torch.float32)
-        image = brief_render(field, camera, 0).image.cpu()
+        camera = read_cameras(self.store.captured, [self.held_out])
+        image = brief_render(brief, camera, 0).image.cpu()
         truth = resize(self.store.captured.read_image("image", self.held_out), image.shape[1], image.shape[0])
         return -10 * math.log10(float((image - torch.from_numpy(truth) / 255).square().mean()) + 1e-10)
 
-    @torch.no_grad()
-    def unknown(self, field: Field, group: int) -> float:
-        """In [0, 1]: how uncertain the field is of the group's middle view, or how much of it no view has seen."""
+    def unknown(self, brief: Reconstructor, group: int) -> float:
+        """In [0, 1]: how uncertain the reconstruction is of the group's middle view, or how much of it no view has
+        seen."""
         targets = self.plan.groups[group].targets
-        camera = self.plan.cameras[[targets[len(targets) // 2]]].to(dtype=torch.float32)
-        rays = Rays(*(part.to(device()) for part in image_rays(camera, 0, PROBE_SIDE, PROBE_SIDE)))
-        last = render_rays(field, rays).rounds[-1]
-        ends = rays.origins + stepfun.quantile(last.t, last.weights, 0.5)[:, None] * rays.directions
+        camera = self.plan.cameras[[targets[len(targets) // 2]]].resize(PROBE_SIDE, PROBE_SIDE)
+        rays = image_rays(camera, 0)
+        ends = rays.origins + brief.render(camera, 0).depth.cpu().reshape(-1, 1) * rays.directions
         known = [v for g in self.kept for v in self.plan.groups[g].targets]
         cameras = Cameras.cat([read_cameras(self.store.captured, self.train), self.plan.cameras[known]])
-        away = unseen(ends.cpu().double(), cameras).to(last.weights)
-        return float(torch.maximum(ray_entropy(last.weights), away).mean())
+        away = unseen(ends.double(), cameras).float()
+        uncertain = brief.uncertainty(camera, 0)
+        return float(away.mean() if uncertain is None else torch.maximum(uncertain.cpu().flatten(), away).mean())

@@ -10,11 +10,10 @@ import time
 from collections.abc import Iterator, Sequence
 
 from flows.errors import describe
-from flows.pipeline.jobs import Job, Step, capture_digests, expected_steps, pending
-from flows.pipeline.locks import writing
-from flows.pipeline.scene import ensure_store, execute_stage, prepare_run, write_timing
+from flows.jobs.job import Job
+from flows.pipeline.keys import expected_steps, pending, stage
+from flows.pipeline.runner import opened, run_missing, write_timing
 from flows.progress import console
-from flows.readers.base import Capture
 from flows.reporting.summary import SAMPLED_AHEAD
 from flows.stages.sample import sample_work
 from flows.workers.fan_out import Totals, fan_out
@@ -22,21 +21,19 @@ from flows.workers.work import Work
 from schemas.scene_store import SceneStore
 from schemas.stages import StageRecord, now
 
-PREPARATION = ("ingest", "poses", "plan", "encode")
-
 
 def sample_ahead(jobs: Sequence[Job]) -> Totals:
     """Prepare the jobs that are to be sampled, then sample them together, with the execution settings of the first.
 
     What fails here is said and left to the scene's own flow, which will meet the same error and report it.
     """
-    generative = [job for job in jobs if job.config.method == "cat3d"]
+    generative = [job for job in jobs if job.generates]
     with contextlib.ExitStack() as stores:
         works: list[Work] = []
         for path in dict.fromkeys(job.store_path for job in generative):
             own = [job for job in generative if job.store_path == path]
             with _left_to_its_flow(own[0].scene_id):
-                stores.enter_context(writing(path, own[0].scene_id))
+                stores.enter_context(opened(own[0]))
                 works += prepared_scene(own)
         if works:
             with _left_to_its_flow(f"{len(works)} runs"):
@@ -73,21 +70,17 @@ def _left_to_its_flow(what: str) -> Iterator[None]:
 def prepared_scene(jobs: Sequence[Job]) -> list[Work]:
     """What is to be sampled of the jobs of a scene whose captured views are encoded as the first's. A scene keeps one
     encoding at a time: those with another model's encoder sample in their own flow, where they encode right before."""
-    capture = jobs[0].capture()
-    digests = capture_digests(capture)
-    steps = [expected_steps(job, capture, digests) for job in jobs]
-    works = [prepared(job, capture, s) for job, s in zip(jobs, steps) if s["encode"].key == steps[0]["encode"].key]
+    encoding = expected_steps(jobs[0])["encode"].key
+    works = [prepared(job) for job in jobs if expected_steps(job)["encode"].key == encoding]
     return [work for work in works if work is not None]
 
 
-def prepared(job: Job, capture: Capture, steps: dict[str, Step]) -> Work | None:
+def prepared(job: Job) -> Work | None:
     """The job's groups to sample, after the stages before sampling; None where they are sampled already, or chosen only
     while sampling."""
-    ensure_store(job, capture)
-    prepare_run(job, capture)
-    for step in pending(job, steps):
-        if step.stage in PREPARATION:
-            execute_stage(job, step)
-    if job.config.skip.rounds or not any(step.stage == "sample" for step in pending(job, steps)):
+    for read in stage("sample").reads:
+        run_missing(job, until=read)
+    step = next((step for step in pending(job) if step.stage == "sample"), None)
+    if step is None or job.config.skip.rounds:
         return None
-    return sample_work(job, SceneStore.open(job.store_path, "r+"), steps["sample"].key)
+    return sample_work(job, SceneStore.open(job.store_path, "r+"), step.key)

@@ -9,7 +9,9 @@ import string
 from pathlib import Path
 
 from flows.errors import InputError
-from flows.pipeline.jobs import Job, capture_digests, expected_steps, make_jobs, pending
+from flows.jobs.job import Job, Request, SplitError
+from flows.jobs.scene import Scene
+from flows.pipeline.keys import pending
 from flows.progress import console
 from schemas.config import SceneSource, SweepConfig, parse_config
 from schemas.errors import ConfigError
@@ -56,17 +58,17 @@ def scene_folders(scene: SceneSource) -> list[str]:
 def scene_jobs(config: SweepConfig, scene: SceneSource, source: str, out: Path, problems: list[str]) -> list[Job]:
     """The jobs of one scene; what can't be had is added to `problems`."""
     jobs: list[Job] = []
+    place = Scene(source, scene.reader, scene.image_folder)
     try:
         for label, settings in config.methods.items():
             for seed in config.seeds:
                 document = merged(config.base, scene.settings, settings, {"seed": seed, "label": label})
                 run = parse_config(document, f"{config.name}: method {label}")
                 for split in config.splits:
+                    request = Request(source, out, (split,), run, scene.reader, scene.image_folder)
                     try:
-                        jobs += make_jobs(source, out, [split], run, scene.reader, scene.image_folder)[1]
-                    except InputError as error:
-                        if "has no split" not in str(error):
-                            raise
+                        jobs += request.jobs(place)
+                    except SplitError as error:
                         problems.append(str(error))
     except InputError as error:
         problems.append(f"{error} {scene.obtain}".strip())
@@ -76,9 +78,7 @@ def scene_jobs(config: SweepConfig, scene: SceneSource, source: str, out: Path, 
 
 def open_jobs(jobs: list[Job]) -> list[Job]:
     """The jobs of one scene that are not complete."""
-    capture = jobs[0].capture()
-    digests = capture_digests(capture)
-    return [job for job in jobs if pending(job, expected_steps(job, capture, digests))]
+    return [job for job in jobs if pending(job)]
 
 
 def run_sweep(config: SweepConfig, out: Path) -> list[str]:

@@ -20,10 +20,11 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from schemas import arrays
+from schemas.documents import nodes
 from schemas.errors import MissingError, StoreError
 from schemas.layout import SCENE_STAGES, STAGES
 from schemas.scene_store import SceneStore, Section
-from schemas.verify import Problem, nodes, orphans, run_of, verify
+from schemas.verify import Problem, orphans, run_of, verify
 
 #: Arrays whose content keys say how many views of a stage are done.
 MARKERS = {"encode": "latents/done_captured", "sample": "generated/done_latent", "decode": "generated/done_image"}
@@ -106,7 +107,7 @@ def stage_rows(store: SceneStore) -> list[dict[str, Any]]:
             record = store.record(stage, run)
             if record is not None:
                 row |= {"complete": True, **record.model_dump(include={"key", "finished_at", "seconds", "work"})}
-                row["decisions"] = record.decisions
+                row["decisions"] = [decision.text for decision in record.decisions]
         except MissingError:
             continue  # the run was removed meanwhile
         except StoreError as error:

@@ -23,12 +23,16 @@ from flows.reporting.summary import (
     markdown,
     method_order,
     method_times,
+    missing_networks,
     number,
+    paper_metrics,
     paper_tables,
     shared_savings,
+    shown_metrics,
     split_order,
     summary_rows,
     timing_rows,
+    title,
 )
 from schemas.layout import STAGES
 from schemas.scene_store import Run, SceneStore
@@ -55,7 +59,7 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
     tables = paper_tables(rows)
     sweep = _document(out / SWEEP) or {}
     environment = Environment(loader=PackageLoader("flows.reporting"), autoescape=select_autoescape(["html", "j2"]))
-    environment.filters["fixed"] = number
+    environment.filters |= {"fixed": number, "title": title}
     published = any(e["published"] for t in tables for d in t["datasets"] for e in d["rows"])
     context = {
         "title": sweep.get("name", out.name),
@@ -65,7 +69,9 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
         "psnr": {(r["scene_id"], r["run"]): r["psnr_db"] for r in rows},
         "tables": tables,
         "published": published,
-        "more": {name: any(r[name] is not None for r in rows) for name in ("clip_score", "depth_abs_rel")},
+        "paper_metrics": paper_metrics(),
+        "shown": shown_metrics(rows),
+        "missing": missing_networks(rows),
         "timings": timings,
         "longest": max((t["total"] for t in timings), default=0.0),
         "methods": method_times(timings),
@@ -99,7 +105,7 @@ def scene_section(out: Path, path: Path) -> dict[str, Any]:
             {
                 "name": name,
                 "views": view_pictures(store, run, truths) if "render" in records else [],
-                "decisions": {stage: record.decisions for stage, record in records.items() if record.decisions},
+                "decisions": {stage: [d.text for d in record.decisions] for stage, record in records.items()},
                 "codes": {stage: record.code_version for stage, record in records.items()},
                 "model": records["sample"].inputs.get("model", "") if "sample" in records else "",
                 "config": run.attrs.get("job", {}).get("config", {}),

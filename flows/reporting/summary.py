@@ -11,20 +11,22 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from cat3d_core.metrics import measures
+from cat3d_core.metrics.measures import Metric
 from flows.progress import console
+from flows.reporting.metric_table import metric_table
 from flows.reporting.published import PUBLISHED
 from schemas.layout import SCENE_STAGES, STAGES
-from schemas.tables import METRICS, TIMINGS, read_rows
+from schemas.tables import TIMINGS, read_rows
 
-METRIC_NAMES = ("psnr_db", "ssim", "lpips")
-MORE_NAMES = ("clip_score", "depth_abs_rel", "surface_chamfer")
 #: Rows of timings that belong to a stage: sampling for all runs of a sweep at once, before their own flows.
 SAMPLED_AHEAD = "sample_ahead"
 
 
 def summary_rows(out: Path, scene_id: str | None = None) -> list[dict[str, Any]]:
-    """One row per (scene, run, protocol): means over held-out views, the seconds of the run's stages, what LPIPS is."""
-    metrics = read_rows(out / "metrics", METRICS).to_pylist()
+    """One row per (scene, run, protocol): means over held-out views and the networks that measured, the seconds of the
+    run's stages."""
+    metrics = read_rows(out / "metrics", metric_table()).to_pylist()
     seconds = {(t["scene_id"], t["run"]): t["total"] for t in timing_rows(out)}
     groups: dict[tuple[str, str, str], list[dict[str, Any]]] = defaultdict(list)
     for row in metrics:
@@ -37,13 +39,41 @@ def summary_rows(out: Path, scene_id: str | None = None) -> list[dict[str, Any]]
             {
                 "scene_id": scene, "run": run, "protocol": protocol, "dataset": first["dataset"],
                 "method": first["method"], "split": first["split"], "seed": first["seed"], "views": len(members),
-                "resolution": f"{first['width']}x{first['height']}", "backbone": first["lpips_backbone"] or "",
-                "clip_network": first.get("clip_network") or "", "masked": bool(first["masked"]),
+                "resolution": f"{first['width']}x{first['height']}", "masked": bool(first["masked"]),
                 "seconds": seconds.get((scene, run)),
-                **{name: mean([m.get(name) for m in members]) for name in (*METRIC_NAMES, *MORE_NAMES)},
+                **{n.column: first.get(n.column) or "" for n in measures.networks(measures.METRICS)},
+                **{metric.name: mean([m.get(metric.name) for m in members]) for metric in measures.METRICS},
             }
         )  # fmt: skip
     return out_rows
+
+
+def paper_metrics() -> list[Metric]:
+    """Those of the paper's Table 1."""
+    return [metric for metric in measures.METRICS if metric.in_paper]
+
+
+def shown_metrics(rows: Sequence[dict[str, Any]]) -> list[Metric]:
+    """The paper's, and those that were measured in any of the rows of the summary."""
+    return [m for m in measures.METRICS if m.in_paper or any(r[m.name] is not None for r in rows)]
+
+
+def missing_networks(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """A sentence for each metric that no row has for want of a network."""
+    lacking = [m.network for m in measures.METRICS if m.network and not any(r[m.name] is not None for r in rows)]
+    return [network.missing for network in dict.fromkeys(lacking)]
+
+
+def title(metric: Metric) -> str:
+    """The metric's name for people, with its unit where that isn't 1."""
+    return metric.title if metric.unit == "1" else f"{metric.title} ({metric.unit})"
+
+
+def measured(row: dict[str, Any], metric: Metric) -> str:
+    """The metric's number in a row of the summary, with the network that measured it where one did."""
+    text = number(row[metric.name], metric.digits)
+    network = row[metric.network.column] if metric.network is not None and row[metric.name] is not None else ""
+    return f"{text} ({network})" if network else text
 
 
 def mean(values: Sequence[float | None]) -> float | None:
@@ -65,8 +95,8 @@ def method_order(method: str) -> tuple[bool, str]:
 def paper_tables(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """The paper's Table 1 for each protocol: {"protocol", "splits", "datasets": [{"name", "rows"}]}.
 
-    A row has "method", "published", "what" (scenes, size, LPIPS network) and "cells", one per split: {"psnr_db",
-    "ssim", "lpips"} or None; ours are means over scenes and seeds. The paper's rows (its own scenes and sizes) stand
+    A row has "method", "published", "what" (scenes, size, networks) and "cells", one per split: {metric: number} of the
+    paper's metrics, or None; ours are means over scenes and seeds. The paper's rows (its own scenes and sizes) stand
     above ours, under the protocol `google`, which is the paper's, or else under the first one.
     """
     tables = []
@@ -94,7 +124,7 @@ def _entry(method: str, published: bool, what: str, members: Sequence[dict[str, 
     cells = []
     for split in splits:
         found = [m for m in members if m["split"] == split]
-        cells.append({n: mean([m[n] for m in found]) for n in METRIC_NAMES} if found else None)
+        cells.append({n.name: mean([m[n.name] for m in found]) for n in paper_metrics()} if found else None)
     return {"method": method, "published": published, "what": what, "cells": cells}
 
 
@@ -104,8 +134,8 @@ def _what(members: Sequence[dict[str, Any]]) -> str:
     parts += [", ".join(sorted({m["resolution"] for m in members}))]
     parts += ["masked"] if any(m["masked"] for m in members) else []
     parts += [f"{len(seeds)} seeds"] if len(seeds) > 1 else []
-    backbones = sorted({m["backbone"] for m in members} - {""})
-    return " · ".join([*parts, *backbones])
+    columns = [network.column for network in measures.networks(tuple(paper_metrics()))]
+    return " · ".join([*parts, *sorted({m[column] for m in members for column in columns} - {""})])
 
 
 def timing_rows(out: Path) -> list[dict[str, Any]]:
@@ -160,8 +190,8 @@ def markdown(rows: Sequence[dict[str, Any]], tables: Sequence[dict[str, Any]]) -
     for table in tables:
         columns = ["data set", "method", "what", *(f"{s} views" for s in table["splits"])]
         lines += [
-            f"PSNR (dB) / SSIM / LPIPS, protocol {table['protocol']}. In italics: the paper's, of other scenes and "
-            "sizes, LPIPS by another network.",
+            f"{' / '.join(map(title, paper_metrics()))}, protocol {table['protocol']}. In italics: the paper's, of "
+            "other scenes and sizes, LPIPS by another network.",
             "",
             _line(columns),
             "|" + "---|" * len(columns),
@@ -174,17 +204,17 @@ def markdown(rows: Sequence[dict[str, Any]], tables: Sequence[dict[str, Any]]) -
                 lines.append(_line([dataset["name"], *styled]))
         lines.append("")
     columns = ["scene", "training views", "method", "seed", "protocol", "resolution", "test views"]
-    columns += ["PSNR (dB)", "SSIM", "LPIPS", "seconds"]
+    shown = shown_metrics(rows)
+    columns += [*map(title, shown), "seconds"]
     lines += [_line(columns), "|" + "---|" * len(columns)]
     for r in rows:
-        lpips = f"{number(r['lpips'], 3)} ({r['backbone']})" if r["lpips"] is not None else "-"
         values = [r[n] for n in ("scene_id", "split", "method", "seed", "protocol", "resolution", "views")]
-        lines.append(_line([*values, *_cell(r)[:2], lpips, number(r["seconds"], 0)]))
+        lines.append(_line([*values, *(measured(r, metric) for metric in shown), number(r["seconds"], 0)]))
     return "\n".join(lines) + "\n"
 
 
 def _cell(row: dict[str, Any]) -> list[str]:
-    return [number(row["psnr_db"], 2), number(row["ssim"], 3), number(row["lpips"], 3)]
+    return [number(row[metric.name], metric.digits) for metric in paper_metrics()]
 
 
 def _line(cells: Sequence[Any]) -> str:
@@ -198,10 +228,11 @@ def number(value: float | None, digits: int) -> str:
 
 def print_metrics(out: Path, scene_id: str) -> None:
     """Print the scene's rows of the summary."""
-    table = Table("run", "protocol", "test views", "PSNR (dB)", "SSIM", "LPIPS", "seconds", title=scene_id)
-    for r in summary_rows(out, scene_id):
-        lpips = f"{number(r['lpips'], 3)} {r['backbone']}" if r["lpips"] is not None else "-"
-        table.add_row(r["run"], r["protocol"], str(r["views"]), number(r["psnr_db"], 2), number(r["ssim"], 3), lpips,
-                      number(r["seconds"], 0))  # fmt: skip
+    rows = summary_rows(out, scene_id)
+    shown = shown_metrics(rows)
+    table = Table("run", "protocol", "test views", *map(title, shown), "seconds", title=scene_id)
+    for r in rows:
+        numbers = [*(measured(r, metric) for metric in shown), number(r["seconds"], 0)]
+        table.add_row(r["run"], r["protocol"], str(r["views"]), *numbers)
     if table.row_count:
         console.print(table)

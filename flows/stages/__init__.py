@@ -1,7 +1,16 @@
-"""The stages of a scene, one module each, in the order of `schemas.layout.STAGES`.
+"""The stages of a scene in the order they run, one module each. What a stage is: `flows/jobs/stage.py`."""
 
-A stage module has VERSION (raised when the same inputs give another result) and `execute(job, store, key) -> Outcome`:
-it reads what earlier stages stored, calls the core, writes its own group of the store; `key` is its content key. An
-optional `inputs(job)` names further inputs of the key. `flows/pipeline/jobs.py` decides whether
-it runs at all.
-"""
+from flows.jobs.stage import Stage
+from flows.stages import decode, encode, evaluate, ingest, plan, poses, reconstruct, render, sample
+
+STAGES: tuple[Stage, ...] = (
+    ingest.STAGE,
+    poses.STAGE,
+    plan.STAGE,
+    encode.STAGE,
+    sample.STAGE,
+    decode.STAGE,
+    reconstruct.STAGE,
+    render.STAGE,
+    evaluate.STAGE,
+)

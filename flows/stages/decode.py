@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,16 +11,16 @@ import torch
 from cat3d_core.diffusion import MultiViewModel
 from flows.generation.groups import view_keys
 from flows.generation.model import model_config, model_hash, shared_model
+from flows.jobs.job import Job, Outcome
+from flows.jobs.stage import Stage, generates
 from flows.media.images import to_uint8
-from flows.pipeline.jobs import Job, Outcome
 from flows.workers.fan_out import fan_out
 from flows.workers.work import Work, is_done
+from schemas.decisions import skipped
 from schemas.scene_store import SceneStore, Section
 
-VERSION = 1
 
-
-def inputs(job: Job) -> dict[str, Any]:
+def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
     """The model's weights."""
     return {"model": model_hash(job)}
 
@@ -35,12 +35,15 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     sampled = np.flatnonzero(generated.read("done_latent").any(-1)).tolist()
     left_out = sorted(set(range(views)) - set(sampled))
     generated.mark_skipped("done_image", left_out)
-    decisions = [f"Skipped decoding {len(left_out)} of {views} views: they were not sampled."] if left_out else []
+    text = f"Skipped decoding {len(left_out)} of {views} views: they were not sampled."
+    decisions = [skipped(text, views=len(left_out))] if left_out else []
     each = [[view] for view in range(views)]
-    work = Work(job, "decode", key, generated, "done_image", "image", view_keys(key, views), [sampled], each)
-    missing = len(work.passes[0])
+    share = Work(
+        job, "decode", key, shared_model, work, generated, "done_image", "image", view_keys(key, views), [sampled], each
+    )
+    missing = len(share.passes[0])
     label = f"decode {job.scene_id} {job.run}"
-    totals = fan_out([work], job.config.execution, label, here=job.config.skip.workers)
+    totals = fan_out([share], job.config.execution, label, here=job.config.skip.workers)
     return Outcome({"views": missing, "evaluations": missing} | totals.work(), decisions + totals.decisions)
 
 
@@ -61,3 +64,6 @@ def work(job: Job, store: SceneStore, key: str, items: Sequence[int]) -> None:
             continue
         generated.write_views("image", decoded(model, generated, view), [view])
         generated.mark_done("done_image", [keys[view]], [view])
+
+
+STAGE = Stage("decode", execute, version=1, reads=("sample",), inputs=inputs, wanted=generates)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,17 +10,17 @@ import torch
 
 from cat3d_core.sample_sets import KINDS, source_boxes
 from flows.generation.groups import CAPTURED_LATENTS
-from flows.generation.model import cpu_threads, device, encoder_hash, forget_model, model_config, shared_model
+from flows.generation.model import encoder_hash, forget_model, model_config, shared_model
+from flows.jobs.device import cpu_threads, device
+from flows.jobs.job import Job, Outcome
+from flows.jobs.stage import Stage, generates
 from flows.media.images import square_image
-from flows.pipeline.jobs import Job, Outcome
 from flows.progress import Meter, meter
 from schemas.content_key import content_key
 from schemas.scene_store import SceneStore
 
-VERSION = 1
 
-
-def inputs(job: Job) -> dict[str, Any]:
+def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
     """The encoder's weights, and which squares are wanted, how large."""
     size = model_config(job).image_size
     return {"model": encoder_hash(job), "image_size": size, "wide": job.config.plan.wide}
@@ -59,3 +60,8 @@ def encode_views(job: Job, store: SceneStore, key: str, kind: str, views: list[i
             store.latents.mark_done(marker, [keys[view]], [view])
             progress.advance()
     return len(missing)
+
+
+STAGE = Stage(
+    "encode", execute, version=1, reads=("poses",), per="scene", inputs=inputs, wanted=generates, passing=True
+)

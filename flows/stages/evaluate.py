@@ -2,41 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from cat3d_core.cameras import Cameras
-from cat3d_core.metrics.clip import VARIABLE as CLIP_VARIABLE
-from cat3d_core.metrics.clip import ClipImageTower, find_clip
-from cat3d_core.metrics.depth import depth_errors
-from cat3d_core.metrics.geometry import chamfer_distance
-from cat3d_core.metrics.perceptual import PerceptualDistance, find_perceptual, perceptual_name
-from cat3d_core.metrics.protocols import PROTOCOLS, evaluate
-from cat3d_core.synthetic.dataset import surface_points
-from flows.pipeline.jobs import Job, Outcome
+from cat3d_core.metrics import measures
+from cat3d_core.metrics.measures import PERCEPTUAL, Comparison, Network
+from cat3d_core.metrics.protocols import PROTOCOLS
+from flows.jobs.access import read_cameras, read_similarity, views_with_role
+from flows.jobs.job import Job, Outcome
+from flows.jobs.stage import Stage, settings_of
 from flows.progress import meter
-from flows.stages.common import read_cameras, read_similarity, views_with_role
+from flows.reporting.metric_table import metric_table
+from flows.stages import render
+from schemas.content_key import content_key
+from schemas.decisions import skipped, warning
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
-from schemas.tables import METRICS, append_rows
+from schemas.tables import append_rows
 
 VERSION = 2
-#: Surfaces further from the scene's origin than this (scene units) don't count in surface_chamfer.
-RADIUS = 2.0
-#: Points of each surface that are compared at most: every pair of them is measured.
-SURFACE_POINTS = 4096
+#: The metrics of this version; one that is added makes rows stale by its name.
+MEASURED = ("psnr_db", "ssim", "lpips", "clip_score", "depth_abs_rel", "surface_chamfer")
 
 
-def inputs(job: Job) -> dict[str, Any]:
-    """Which perceptual networks this machine has decides the LPIPS and CLIP columns."""
-    clip = find_clip()
-    return {
-        "perceptual": perceptual_name() if job.config.evaluate.lpips else None,
-        "clip": clip.name if clip else None,
+def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
+    """Of the renders those of held-out views alone, so that a new path changes no number; which networks this machine
+    has, which decides their columns; metrics that were added."""
+    test = {"views": job.view_names("test"), "rendered": job.config.render.test_views}
+    found: dict[str, Any] = {
+        "render key": content_key(field=keys["reconstruct"], test=test, version=str(render.VERSION))
     }
+    found |= {n.key: n.name() if _wanted(job, n) else None for n in measures.networks(measures.METRICS)}
+    added = [metric.name for metric in measures.METRICS if metric.name not in MEASURED]
+    return found | ({"metrics": added} if added else {})
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
@@ -49,31 +51,32 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     rows: list[dict[str, Any]] = []
     decisions = []
     if test and job.config.render.test_views:
-        perceptual = find_perceptual() if job.config.evaluate.lpips else None
-        if perceptual is None:
-            decisions.append("No perceptual network on this machine, or lpips is off: the lpips column is empty.")
-        clip = find_clip()
-        if clip is None:
-            decisions.append(f"No CLIP weights ({CLIP_VARIABLE} names a file of them): the clip_score column is empty.")
-        renders = run.renders("test")
-        names = store.captured.read("name")
-        depths = job.capture().depths
-        cameras, scale = read_cameras(renders), read_similarity(store).scale
+        known = measures.networks(measures.METRICS)
+        networks = {n.key: found for n in known if _wanted(job, n) and (found := n.load()) is not None}
+        decisions += [warning(n.missing) for n in known if n.key not in networks]
+        named = {n.column: networks[n.key].name for n in known if n.key in networks}
+        renders, names = run.renders("test"), store.captured.read("name")
+        depths, scale = job.capture().depths, np.float32(read_similarity(store).scale)
+        cameras = read_cameras(renders)
         with meter(f"evaluate {job.scene_id} {job.run}", len(test)) as progress:
             for i, view in enumerate(test):
+                what = _what(job, key) | {"view": view, "view_name": str(names[view])} | named
+                geometry: dict[str, Any] = {}
+                if depths is not None:
+                    geometry = {n: torch.from_numpy(renders.read_image(n, i)) for n in ("depth", "opacity")}
+                    geometry |= {"true_depth": torch.from_numpy(depths[view] * scale), "camera": cameras[i]}
                 image, truth = renders.read_image("image", i), store.captured.read_image("image", view)
                 mask = store.captured.read_image("mask", view) if "mask" in store.captured else None
-                common = _what(job, key) | {"view": view, "view_name": str(names[view])} | clip_row(clip, image, truth)
-                if depths is not None:
-                    depth, opacity = renders.read_image("depth", i), renders.read_image("opacity", i)
-                    common |= geometry_row(depth, opacity, depths[view] * np.float32(scale), cameras[i])
-                for protocol in job.config.evaluate.protocols:
-                    rows.append(common | view_row(protocol, image, truth, mask, perceptual))
+                rows += view_rows(job.config.evaluate.protocols, image, truth, mask, what, networks, geometry)
                 progress.advance()
     else:
-        decisions.append("This run has no rendered held-out views: there is nothing to compare.")
-    append_rows(job.results_path / "metrics", METRICS, rows, f"{job.scene_id}.{job.run}")
+        decisions.append(skipped("This run has no rendered held-out views: there is nothing to compare."))
+    append_rows(job.results_path / "metrics", metric_table(), rows, f"{job.scene_id}.{job.run}")
     return Outcome({"views": len(test)}, decisions)
+
+
+def _wanted(job: Job, network: Network) -> bool:
+    return job.config.evaluate.lpips or network is not PERCEPTUAL
 
 
 def _what(job: Job, key: str) -> dict[str, Any]:
@@ -89,48 +92,23 @@ def _image(pixels: np.ndarray) -> Tensor:
     return torch.from_numpy(pixels.astype(np.float32) / 255).permute(2, 0, 1)
 
 
-def view_row(
-    protocol: str, image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None, perceptual: PerceptualDistance | None
-) -> dict[str, Any]:
-    """One view under one protocol, from (H, W, 3) uint8: masked where the protocol defines masks and there is one."""
-    masked = mask is not None and PROTOCOLS[protocol].mask != "none"
-    weight = torch.from_numpy((mask >= 128).astype(np.float32)) if mask is not None and masked else None
-    measured = evaluate(protocol, _image(image), _image(truth), weight, perceptual)
-    lpips = measured.get(perceptual.name) if perceptual is not None else None
+def view_rows(
+    protocols: tuple[str, ...], image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None, what: dict[str, Any],
+    networks: Mapping[str, Any], geometry: Mapping[str, Any],
+) -> list[dict[str, Any]]:  # fmt: skip
+    """A row for each protocol, from (H, W, 3) uint8: masked where the protocol defines masks and there is one (H, W).
+    what: columns of all of them; geometry: what is known of depths, see `Comparison`."""
     height, width = image.shape[:2]
-    return {
-        "protocol": protocol, "width": width, "height": height, "masked": masked, "psnr_db": measured["psnr"],
-        "ssim": measured["ssim"], "lpips": lpips,
-        "lpips_backbone": perceptual.name if perceptual is not None and lpips is not None else None,
-    }  # fmt: skip
+    masks = [mask if PROTOCOLS[p].mask != "none" else None for p in protocols]
+    weights = [torch.from_numpy((m >= 128).astype(np.float32)) if m is not None else None for m in masks]
+    views = [
+        Comparison(p, _image(image), _image(truth), weight, networks=networks, **geometry)
+        for p, weight in zip(protocols, weights, strict=True)
+    ]
+    return [
+        what | numbers | {"protocol": v.protocol, "width": width, "height": height, "masked": v.mask is not None}
+        for v, numbers in zip(views, measures.measure(views, measures.METRICS), strict=True)
+    ]
 
 
-def clip_row(clip: ClipImageTower | None, image: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
-    """CLIP score of one view, from (H, W, 3) uint8; nothing without the network."""
-    if clip is None:
-        return {}
-    return {"clip_score": float(clip.score(_image(image)[None], _image(truth)[None])), "clip_network": clip.name}
-
-
-def geometry_row(depth: np.ndarray, opacity: np.ndarray, truth: np.ndarray, camera: Cameras) -> dict[str, Any]:
-    """Depth and surface errors of one view. depth, opacity (h, w): rendered; truth (H, W): true z-depth, both in scene
-    units, inf where there is no surface. A column is left out where one of the two has no surface to compare."""
-    height, width = depth.shape
-    rows, columns = (((np.arange(n) + 0.5) * m / n).astype(int) for n, m in zip((height, width), truth.shape))
-    exact = torch.from_numpy(truth[rows][:, columns]).double()
-    found = torch.from_numpy(depth).double()
-    row: dict[str, Any] = {}
-    if bool(exact.isfinite().any()):
-        row["depth_abs_rel"] = float(depth_errors(found[None], exact[None])["abs_rel"])
-    found = found.where(torch.from_numpy(opacity) >= 0.5, torch.inf)
-    surfaces = [_surface(z, camera) for z in (found, exact)]
-    if all(len(points) for points in surfaces):
-        row["surface_chamfer"] = chamfer_distance(surfaces[0], surfaces[1])["chamfer"]
-    return row
-
-
-def _surface(depth: Tensor, camera: Cameras) -> Tensor:
-    """(P, 3) points near the scene's origin that the view sees, evenly thinned out; depth inf: nothing there."""
-    points = surface_points(depth[None], camera)
-    points = points[points.norm(dim=-1) <= RADIUS]
-    return points[:: max(1, -(-len(points) // SURFACE_POINTS))]
+STAGE = Stage("evaluate", execute, version=VERSION, reads=("render",), settings=settings_of("evaluate"), inputs=inputs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -11,14 +12,14 @@ from torch import Tensor
 
 from cat3d_core.cameras import Cameras
 from flows.errors import InputError
+from flows.jobs.job import Job, Outcome
+from flows.jobs.stage import Stage, settings_of
 from flows.media import images
-from flows.pipeline.jobs import Job, Outcome, capture_digests
 from flows.progress import meter
 from flows.readers.base import Capture
 from schemas.config import IngestConfig
+from schemas.decisions import chosen, warning
 from schemas.scene_store import SceneStore
-
-VERSION = 1
 
 
 class Ingested(NamedTuple):
@@ -29,9 +30,11 @@ class Ingested(NamedTuple):
     intrinsics: Tensor | None
 
 
-def inputs(job: Job) -> dict[str, Any]:
-    """Where cameras are estimated though there are some, the pose stage writes other images over these."""
-    return {"estimate": "always"} if job.config.poses.estimate == "always" else {}
+def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
+    """The photos and their lens; where cameras are estimated though there are some, the pose stage writes other images
+    over these."""
+    found = {name: job.scene.digests[name] for name in ("images", "lens")}
+    return found | ({"estimate": "always"} if job.config.poses.estimate == "always" else {})
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
@@ -46,22 +49,22 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
             return out
 
         views = list(pool.map(one, range(count)))
-    write_captured(store, capture, views)
-    decisions = list(capture.notes)
+    write_captured(store, capture, job.scene.digests["images"], views)
+    decisions = [warning(note) for note in capture.notes]
     if capture.distortion is not None and capture.distortion.any():
-        decisions.append("The images were undistorted; the stored intrinsics are those of the pinhole images.")
+        decisions.append(chosen("The images were undistorted; the stored intrinsics are those of the pinhole images."))
     pixels = sum(v.image.shape[0] * v.image.shape[1] for v in views)
     return Outcome({"views": count, "pixels": pixels}, decisions)
 
 
-def write_captured(store: SceneStore, capture: Capture, views: list[Ingested]) -> None:
+def write_captured(store: SceneStore, capture: Capture, digests: dict[str, str], views: list[Ingested]) -> None:
     """Write all views' images (padded to the largest), sizes, names and digests, and K where it is known."""
     captured = store.captured
     sizes = np.array([[v.image.shape[1], v.image.shape[0]] for v in views], np.int32)
     width, height = sizes.max(0)
     captured.write("size", sizes)
     captured.write("name", np.array(capture.names, dtype=object))
-    captured.write("source_sha256", np.array(list(capture_digests(capture)["images"].values()), dtype=object))
+    captured.write("source_sha256", np.array(list(digests.values()), dtype=object))
     captured.create_array("image", (len(views), height, width, 3))
     captured.write_images("image", [v.image for v in views], range(len(views)))
     masks = [v.mask for v in views]
@@ -122,3 +125,6 @@ def ingest_view(
         mask = images.resize(mask, small_width, small_height)
     small = None if camera is None else camera.resize(small_width, small_height).intrinsics[0]
     return Ingested(image, mask, small)
+
+
+STAGE = Stage("ingest", execute, version=1, per="scene", settings=settings_of("ingest"), inputs=inputs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,20 +12,23 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.plan import Plan, PlanConfig, make_plan
 from cat3d_core.sample_sets import KINDS
 from flows.generation.model import model_config
-from flows.pipeline.jobs import Job, Outcome
-from flows.stages.common import read_cameras, views_with_role, write_cameras
+from flows.jobs.access import read_cameras, views_with_role, write_cameras
+from flows.jobs.job import Job, Outcome
+from flows.jobs.stage import Stage, generates, settings_of
+from schemas.decisions import chosen
 from schemas.errors import ConfigError
 from schemas.scene_store import Run, SceneStore
 
-VERSION = 1
 #: `skip.covered_path`: how much of what the path's views see captured views must show from nearby directions.
 COVERED_SHARE = 0.9
 
 
-def inputs(job: Job) -> dict[str, Any]:
-    """What the model wants (the side of its images in pixels, the views of a group), and what may be skipped."""
+def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
+    """The training views, what the model wants (the side of its images in pixels, the views of a group), and what may
+    be skipped."""
     model, skip = model_config(job), job.config.skip
     return {
+        "train": job.view_names("train"),
         "image_size": model.image_size,
         "views": model.views,
         "drop_by_coverage": skip.coverage,
@@ -46,8 +50,9 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     (job.pictures / "plan.png").write_bytes(picture)
     anchors = int(plan.anchor.sum())
     summary = f"{len(plan)} views of the trajectory {plan.recipe} in {len(plan.group_views)} groups"
-    decisions = [f"{summary}, {anchors} of them anchors." if anchors else f"{summary}."]
-    return Outcome({"views": len(plan), "groups": len(plan.group_views)}, decisions + plan.reasons)
+    decisions = [chosen(f"{summary}, {anchors} of them anchors." if anchors else f"{summary}.")]
+    decisions += map(chosen, plan.reasons)
+    return Outcome({"views": len(plan), "groups": len(plan.group_views)}, decisions)
 
 
 def plan_run(job: Job, store: SceneStore, run: Run) -> tuple[Plan, list[int]]:
@@ -66,7 +71,7 @@ def plan_run(job: Job, store: SceneStore, run: Run) -> tuple[Plan, list[int]]:
 
 def core_config(job: Job, captured: Cameras) -> PlanConfig:
     """The core's settings for the run's; conditioning views and targets together are what the model was trained for."""
-    settings, model, skip = job.config.plan, model_config(job), inputs(job)
+    settings, model, skip = job.config.plan, model_config(job), job.config.skip
     conditions = settings.condition_views or min(3, model.views - 1)
     group_size = settings.group_size
     if group_size is None and model.views != 8:
@@ -90,8 +95,8 @@ def core_config(job: Job, captured: Cameras) -> PlanConfig:
         keep_captured=settings.always_captured,
         samples="both" if settings.wide and not_square else "square",
         image_size=model.image_size,
-        drop_by_coverage=skip["drop_by_coverage"],
-        covered_share=skip["covered_share"],
+        drop_by_coverage=skip.coverage,
+        covered_share=COVERED_SHARE if skip.covered_path else None,
     )
 
 
@@ -135,3 +140,8 @@ def write_plan(run: Run, plan: Plan, train: list[int], captured_count: int) -> N
 
 def _points(store: SceneStore) -> torch.Tensor | None:
     return torch.from_numpy(store.captured.read("points")) if "points" in store.captured else None
+
+
+STAGE = Stage(
+    "plan", execute, version=1, reads=("poses",), settings=settings_of("plan", "seed"), inputs=inputs, wanted=generates
+)

@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
 
 from cat3d_core.cameras import Cameras, orthonormalize
 from cat3d_core.normalization import Similarity, normalize_scene
+from flows.jobs.access import write_cameras
+from flows.jobs.job import Job, Outcome
+from flows.jobs.stage import Stage, settings_of
 from flows.media import images
-from flows.pipeline.jobs import Job, Outcome
 from flows.progress import Meter, meter
 from flows.readers.base import Capture
 from flows.sfm.poses import PoseSettings, estimate_poses
-from flows.stages.common import write_cameras
 from flows.stages.ingest import ingest_view, write_captured
+from schemas.decisions import Decision, chosen, skipped
 from schemas.scene_store import SceneStore
 
-VERSION = 1
+
+def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
+    """The given cameras and points."""
+    return {"cameras": job.scene.digests["cameras"]}
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
@@ -28,7 +35,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     if job.config.poses.estimate == "always":
         capture = dataclasses.replace(capture, cameras=None, distortion=None, points=None, depth_bounds=None)
     if capture.cameras is not None:
-        decisions = ["Skipped pose estimation: the cameras are given."]
+        decisions = [skipped("Skipped pose estimation: the cameras are given.")]
         cameras = _stored_cameras(store, capture.cameras)
         registered = np.ones(len(capture), bool)
         points, bounds = capture.points, capture.depth_bounds
@@ -37,7 +44,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
         bounds = None
     if job.config.poses.normalize:
         similarity = normalize_scene(cameras[np.flatnonzero(registered).tolist()], points, bounds)
-        decisions.append(f"The scene's scale was set from {similarity.method}.")
+        decisions.append(chosen(f"The scene's scale was set from {similarity.method}."))
     else:
         similarity = Similarity(1.0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), "none")
     write_poses(store, cameras, registered, similarity, points, bounds)
@@ -46,13 +53,13 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
 
 def _estimate(
     job: Job, store: SceneStore, capture: Capture
-) -> tuple[Cameras, np.ndarray, torch.Tensor | None, list[str]]:
+) -> tuple[Cameras, np.ndarray, torch.Tensor | None, list[Decision]]:
     """Cameras of all views by structure from motion; the stored images are undistorted with the lens that was found.
 
     Views that could not be placed get the first placed camera and registered = False.
     """
     settings = job.config.poses
-    chosen = PoseSettings(
+    asked = PoseSettings(
         max_features=settings.max_features, minimum_share=settings.min_registered, camera_model=settings.camera_model
     )
     photos = capture.images if capture.images is not None else capture.paths
@@ -64,7 +71,7 @@ def _estimate(
                 meters[step] = stack.enter_context(meter(f"poses {job.scene_id}: {step}", total))
             meters[step].update(done)
 
-        result = estimate_poses(photos, job.config.seed, on_progress=on_progress, masks=capture.masks, settings=chosen)
+        result = estimate_poses(photos, job.config.seed, on_progress=on_progress, masks=capture.masks, settings=asked)
     registered = np.zeros(len(capture), bool)
     registered[result.registered] = True
     row = {view: i for i, view in enumerate(result.registered)}
@@ -80,13 +87,13 @@ def _estimate(
                 width, height = images.image_size(capture.paths[view])
             camera = camera.resize(width, height)
         views.append(ingest_view(capture, view, job.config.ingest, lens, camera))
-    write_captured(store, capture, views)
+    write_captured(store, capture, job.scene.digests["images"], views)
     size = torch.from_numpy(store.captured.read("size").astype(np.int64))
     poses = torch.stack([result.cameras.world_from_camera[row.get(v, 0)] for v in range(len(capture))])
     intrinsics = torch.from_numpy(store.captured.read("intrinsics"))
     cameras = Cameras(intrinsics, orthonormalize(poses), size)
     points = result.points if len(result.points) else None
-    return cameras, registered, points, [result.report.summary()]
+    return cameras, registered, points, [chosen(result.report.summary())]
 
 
 def _stored_cameras(store: SceneStore, given: Cameras) -> Cameras:
@@ -124,3 +131,8 @@ def write_poses(
             "method": similarity.method,
         }
     )
+
+
+STAGE = Stage(
+    "poses", execute, version=1, reads=("ingest",), per="scene", settings=settings_of("poses", "seed"), inputs=inputs
+)

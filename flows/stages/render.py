@@ -2,34 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import torch
 
 from cat3d_core.cameras import Cameras
+from cat3d_core.reconstruction import Reconstructor
 from cat3d_core.trajectories import RECIPES, Shift, choose_recipe, scene_frame
-from cat3d_core.zipnerf import Field, render_image
+from flows.jobs.access import read_cameras, views_with_role, write_cameras
+from flows.jobs.job import Job, Outcome
+from flows.jobs.stage import Stage, settings_of
 from flows.media import images
 from flows.media.pictures import depth_picture
 from flows.media.video import write_video
-from flows.pipeline.jobs import Job, Outcome
 from flows.progress import Meter, meter
-from flows.stages.common import read_cameras, views_with_role, write_cameras
-from flows.stages.reconstruct import read_field
+from flows.reconstruction.stored import read_reconstruction
 from schemas.content_key import array_digest, content_key
+from schemas.decisions import skipped
 from schemas.scene_store import Run, SceneStore, Section
 
+#: Raised when the same field and cameras give other pictures.
 VERSION = 1
+
+
+def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
+    """The held-out views."""
+    return {"test": job.view_names("test")}
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     """Write `renders/test` and `renders/path`: image, depth, opacity per view, each view recorded when it is done."""
     run = store.run(job.run)
-    field = read_field(job, run)
+    scene = read_reconstruction(store, run)
     settings = job.config.render
     test = views_with_role(store, run, "test") if settings.test_views else []
     captured = read_cameras(store.captured)
     jobs = [("test", captured[test], test)] if test else []
-    decisions = [] if test else ["No held-out views to render: this split has none."]
+    decisions = [] if test else [skipped("No held-out views to render: this split has none.")]
     if settings.path != "none":
         path = camera_path(job, store, run)
         jobs.append(("path", path, list(range(len(path)))))
@@ -37,10 +48,11 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     rendered, rays = 0, 0
     with meter(f"render {job.scene_id} {job.run}", total) as progress:
         for kind, cameras, views in jobs:
-            made = render_views(run.renders(kind), field, cameras, views, _field_key(job, store), progress)
+            made = render_views(run.renders(kind), scene, cameras, views, _field_key(job, store), progress)
             rendered, rays = rendered + len(made), rays + sum(made)
     if rendered < total:
-        decisions.append(f"Skipped {total - rendered} of {total} renders: they are of this field and these cameras.")
+        text = f"Skipped {total - rendered} of {total} renders: they are of this field and these cameras."
+        decisions.append(skipped(text, views=total - rendered))
     write_pictures(job, run, test)
     return Outcome({"views": rendered, "rays": rays}, decisions)
 
@@ -52,7 +64,7 @@ def _field_key(job: Job, store: SceneStore) -> str:
 
 
 def render_views(
-    section: Section, field: Field, cameras: Cameras, views: list[int], key: str, progress: Meter
+    section: Section, scene: Reconstructor, cameras: Cameras, views: list[int], key: str, progress: Meter
 ) -> list[int]:
     """Render the cameras that are not done yet under `key`; the number of rays cast for each that was rendered."""
     width, height = (int(s) for s in cameras.size.max(0).values)
@@ -70,7 +82,7 @@ def render_views(
         if done[i]:
             progress.advance()
             continue
-        out = render_image(field, cameras.to(dtype=torch.float32), i)
+        out = scene.render(cameras, i)
         section.write_images("image", [images.to_uint8(out.image)], [i])
         for name, values in (("depth", out.depth), ("opacity", out.opacity)):
             padded = np.zeros((1, height, width), np.float32)
@@ -119,3 +131,6 @@ def _depth_range(section: Section) -> tuple[float, float]:
     depth = section.read("depth")
     inside = depth[depth > 0]
     return tuple(np.quantile(inside, [0.01, 0.95]).tolist()) if inside.size else (0.1, 1.0)
+
+
+STAGE = Stage("render", execute, version=VERSION, reads=("reconstruct",), settings=settings_of("render"), inputs=inputs)

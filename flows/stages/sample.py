@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,18 +15,19 @@ from flows.generation.groups import Group, StoredPlan, view_keys
 from flows.generation.model import model_config, model_hash, sampler_config, sampler_settings, shared_model
 from flows.generation.rounds import OneRound, Rounds
 from flows.generation.shrinking import sample_at_most
-from flows.pipeline.jobs import Job, Outcome
+from flows.jobs.job import Job, Outcome
+from flows.jobs.stage import Stage, generates, settings_of
 from flows.workers.fan_out import Totals, fan_out
 from flows.workers.work import Work, is_done
+from schemas.decisions import Decision, chosen, skipped
 from schemas.scene_store import SceneStore
 
-VERSION = 1
 #: `skip.near_steps`: mean pose distance (scene distances, about radians of turning) from a group's views to the nearest
 #: captured view below which the group takes half of the steps.
 NEAR = 0.25
 
 
-def inputs(job: Job) -> dict[str, Any]:
+def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
     """The model's weights, the sampler it is used with, and how the views are chosen."""
     return {"model": model_hash(job), "sampler": sampler_settings(job), "rounds": job.config.skip.rounds}
 
@@ -42,19 +43,19 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     totals, groups, spared = Totals(), [], set(range(len(plan.groups)))
     for passes in rounds:
         spared -= {g for items in passes for g in items}
-        work = sample_work(job, store, key, passes)
-        groups += [g for items in work.passes for g in items]
+        share = sample_work(job, store, key, passes)
+        groups += [g for items in share.passes for g in items]
         label = f"sample {job.scene_id} {job.run}"
-        totals += fan_out([work], job.config.execution, label, here=job.config.skip.workers)
+        totals += fan_out([share], job.config.execution, label, here=job.config.skip.workers)
     made = {view for g in rounds.kept for view in plan.groups[g].targets}
     left_out = sorted(set(range(len(plan))) - made)
     run.generated.mark_skipped("done_latent", left_out)
     decisions = []
     if left_out:
         saved = sum(group_evaluations(job, plan.groups[g], group_sampler(job, plan, plan.groups[g])) for g in spared)
-        decisions.append(
-            f"{len(left_out)} of {len(plan)} planned views were left out; {saved} network evaluations were saved."
-        )
+        text = f"{len(left_out)} of {len(plan)} planned views were left out; {saved} network evaluations were saved."
+        switch = "rounds" if plan.needed else "covered_path"
+        decisions.append(skipped(text, switch, views=len(left_out), evaluations=saved))
     decisions += rounds.decisions + sampler_decisions(job, plan, rounds.kept) + totals.decisions
     configs = [group_sampler(job, plan, plan.groups[g]) for g in groups]
     counts = {"views": sum(len(plan.groups[g].targets) for g in groups), "groups": len(groups)}
@@ -73,7 +74,7 @@ def sample_work(job: Job, store: SceneStore, key: str, passes: Sequence[Sequence
     run.generated.create_array("done_latent", (len(plan), 32))
     targets = [group.targets for group in plan.groups]
     keys, passes = view_keys(key, len(plan)), plan.passes() if passes is None else passes
-    return Work(job, "sample", key, run.generated, "done_latent", "latent", keys, passes, targets)
+    return Work(job, "sample", key, shared_model, work, run.generated, "done_latent", "latent", keys, passes, targets)
 
 
 def latent_shape(job: Job) -> tuple[int, int, int]:
@@ -103,7 +104,7 @@ def sampling_flops(job: Job, plan: StoredPlan) -> float:
     return each * sum(group_evaluations(job, group, group_sampler(job, plan, group)) for group in plan.groups)
 
 
-def sampler_decisions(job: Job, plan: StoredPlan, groups: Sequence[int]) -> list[str]:
+def sampler_decisions(job: Job, plan: StoredPlan, groups: Sequence[int]) -> list[Decision]:
     """What of the sampler's work was skipped for these groups."""
     if not groups:
         return []
@@ -111,19 +112,17 @@ def sampler_decisions(job: Job, plan: StoredPlan, groups: Sequence[int]) -> list
     full, scale = group_evaluations(job, first, config), config.guidance.scale
     guided = full - config.steps
     how = f"guided by {scale:g} in {guided} of them" if guided else "without guidance"
-    out = [f"{full} evaluations of the network a group: {config.steps} steps of {config.solver}, {how}."]
+    out = [chosen(f"{full} evaluations of the network a group: {config.steps} steps of {config.solver}, {how}.")]
     if scale != 1 and guided < config.steps:
-        out.append(
-            f"Skipped the unconditional half in {config.steps - guided} steps: guidance is on at log-SNR from "
-            f"{config.guidance.low_log_snr:g} to {config.guidance.high_log_snr:g}."
-        )
+        text = f"Skipped the unconditional half in {config.steps - guided} steps: guidance is on at log-SNR from "
+        text += f"{config.guidance.low_log_snr:g} to {config.guidance.high_log_snr:g}."
+        out.append(skipped(text, "guidance", evaluations=(config.steps - guided) * len(groups)))
     near = [c for g in groups if (c := group_sampler(job, plan, plan.groups[g])) != config]
     if near:
         saved = sum(full - group_evaluations(job, first, c) for c in near)
-        out.append(
-            f"{len(near)} of {len(groups)} groups are nearer than {NEAR:g} to a captured view and took "
-            f"{near[0].steps} steps: {saved} of {full * len(groups)} evaluations were saved."
-        )
+        text = f"{len(near)} of {len(groups)} groups are nearer than {NEAR:g} to a captured view and took "
+        text += f"{near[0].steps} steps: {saved} of {full * len(groups)} evaluations were saved."
+        out.append(skipped(text, "near_steps", evaluations=saved))
     return out
 
 
@@ -171,3 +170,14 @@ def network_inputs(
         torch.stack([plan.raymaps(g, shape[-1]) for g in groups]),
         torch.stack([plan.noise(g, shape) for g in groups]),
     )
+
+
+STAGE = Stage(
+    "sample",
+    execute,
+    version=1,
+    reads=("plan", "encode"),
+    settings=settings_of("sample", "seed", without=("checkpoint",)),  # the hash of its weights is among the inputs
+    inputs=inputs,
+    wanted=generates,
+)

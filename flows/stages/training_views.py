@@ -9,43 +9,44 @@ import numpy as np
 import torch
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.zipnerf import Views
+from cat3d_core.reconstruction import Views
 from flows.generation.brief import LEAST, shown_by_captured
+from flows.jobs.access import read_cameras, read_images, views_with_role
+from flows.jobs.job import Job
 from flows.media.images import resize
-from flows.pipeline.jobs import Job
-from flows.stages.common import read_cameras, read_images, views_with_role
+from schemas.decisions import Decision, chosen, skipped
 from schemas.scene_store import Run, SceneStore
 
 
-def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, float, list[str]]:
-    """The run's training views: captured ones, and the generated ones where the run has them; which share of the
-    generated pixels is left out, as captured views show them too; what was decided."""
+def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[Decision]]:
+    """The run's training views: captured ones, and the generated ones where the run has them; what was decided."""
     train = views_with_role(store, run, "train")
     cameras = read_cameras(store.captured, train)
     images = read_images(store.captured, train)
     decisions = []
-    if job.config.method == "zipnerf":
-        decisions.append("No views were generated: method zipnerf trains on captured views alone.")
+    if not job.generates:
+        decisions.append(chosen("No views were generated: method zipnerf trains on captured views alone."))
     else:
         made = list(generated_views(run))
         if job.config.skip.detail:
-            # It would be learned at the cost of what all views have in common (docs/sweeps.md).
+            # It would be learned at the cost of what all views have in common (docs/guides/sweep.md).
             finest = float(cameras.intrinsics[:, 0, 0].max())
             whole, made = made, [no_finer(*view, finest) for view in made]
             reduced = [(a, b) for (_, a), (_, b) in zip(whole, made, strict=True) if a is not b]
             if reduced:
                 share = sum(b.numel() for _, b in reduced) / sum(a.numel() for a, _ in reduced)
-                decisions.append(
-                    f"{len(reduced)} of {len(made)} generated views were reduced to {share:.0%} of their pixels: "
-                    "no captured view shows finer detail."
-                )
+                text = f"{len(reduced)} of {len(made)} generated views were reduced to {share:.0%} of their pixels: "
+                text += "no captured view shows finer detail."
+                pixels = sum(a.numel() - b.numel() for a, b in reduced) // 3
+                decisions.append(skipped(text, "detail", pixels=pixels))
         cameras = Cameras.cat([cameras, *(camera for camera, _ in made)])
         images += [image for _, image in made]
         if not made:
-            decisions.append("Trained on captured views alone, without the LPIPS loss: no view was generated.")
+            text = "Trained on captured views alone, without the LPIPS loss: no view was generated."
+            decisions.append(skipped(text, "covered_path"))
     captured = torch.arange(len(cameras)) < len(train)
-    views, share, told = unseen_alone(job, Views(cameras, images, captured))
-    return views, share, decisions + told
+    views, told = unseen_alone(job, Views.from_images(cameras, images, captured))
+    return views, decisions + told
 
 
 def generated_views(run: Run) -> Iterator[tuple[Cameras, torch.Tensor]]:
@@ -66,18 +67,17 @@ def no_finer(camera: Cameras, image: torch.Tensor, focal: float) -> tuple[Camera
     return camera.resize(width, height), torch.from_numpy(resize(image.numpy(), width, height))
 
 
-def unseen_alone(job: Job, views: Views) -> tuple[Views, float, list[str]]:
-    """The views without those pixels of generated ones that two captured ones show as well, which share of the
-    generated pixels those are, and what was decided."""
+def unseen_alone(job: Job, views: Views) -> tuple[Views, list[Decision]]:
+    """The views without those pixels of generated ones that two captured ones show as well, and what was decided."""
     captured = int(views.captured.sum())
     if not job.config.skip.seen or captured == len(views) or captured < LEAST:
-        return views, 0.0, []
+        return views, []
     started = time.monotonic()
-    shown = shown_by_captured(views, job.config.seed, job.config.execution.threads)
+    shown = shown_by_captured(job, views)
     share = float(shown.sum() / views.size[~views.captured].prod(-1).sum())
     told = (
         f"{share:.0%} of the pixels of generated views were not trained on, since {LEAST} captured views show their "
         f"places as well: so says a field of those alone ({time.monotonic() - started:.0f} s). At least as large a "
         "share of the rays is theirs."
     )
-    return views.only(~shown), share, [told]
+    return views.only(~shown), [skipped(told, "seen", pixels=int(shown.sum()))]

@@ -18,6 +18,7 @@ from cat3d_core.diffusion import (
     save_model,
     save_state,
 )  # fmt: skip
+from cat3d_core.diffusion.training import half_cosine
 from cat3d_core.random import generator
 from flows.progress import meter
 from flows.training.bank import jitter_scale
@@ -58,8 +59,7 @@ def share_done(config: TrainRunConfig, steps: int, clock: Clock) -> float:
 def set_rate(trainer: Trainer, config: TrainRunConfig, done: float) -> None:
     """Half a cosine from the learning rate to the final one over the training, whether it counts steps or minutes."""
     peak, last = config.optimizer.learning_rate, config.optimizer.final_learning_rate
-    shape = replace(trainer.config, learning_rate=peak, final_learning_rate=peak if last is None else last)
-    fixed = replace(shape, warmup_steps=0, total_steps=1_000_000).learning_rate_at(round(1_000_000 * done))
+    fixed = half_cosine(peak, peak if last is None else last, done)
     trainer.config = replace(trainer.config, learning_rate=fixed, final_learning_rate=fixed)
 
 

@@ -45,7 +45,7 @@ def dask_batch(document: str, label: str) -> str:
 class DaskExecutor:
     """A cluster of its own, or a running one. Dask itself gives a dead worker's batch to another worker."""
 
-    ahead = 1  # a task's way through Prefect and Dask takes 0.1 s and more, see docs/scaling.md
+    ahead = 1  # a task's way through Prefect and Dask takes 0.1 s and more, see docs/explanation/scaling.md
 
     def __init__(self, settings: ExecutionConfig) -> None:
         self.resources = dict(settings.dask_resources)

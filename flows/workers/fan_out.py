@@ -16,6 +16,7 @@ from flows.progress import Meter, meter
 from flows.workers.executors import Executor, open_executor
 from flows.workers.work import Answer, Batch, Work, run_batch
 from schemas.config import ExecutionConfig
+from schemas.decisions import Decision, skipped, warning
 from schemas.scene_store import SceneStore
 
 POLL_S = 1.0
@@ -31,7 +32,7 @@ class Totals:
     batches: int = 0
     busy_seconds: float = 0.0
     loading_seconds: float = 0.0
-    decisions: list[str] = field(default_factory=list)
+    decisions: list[Decision] = field(default_factory=list)
 
     def __add__(self, other: Totals) -> Totals:
         summed = {name: getattr(self, name) + getattr(other, name) for name in vars(self) if name != "workers"}
@@ -67,7 +68,8 @@ def fan_out(works: Sequence[Work], settings: ExecutionConfig, label: str, here: 
         if here and settings.workers is None and settings.executor == "local":
             done = _done_here(works, settings, progress)
             if not any(items for work in works for items in work.passes):
-                done.decisions.append("Started no workers: this process did it in less than a batch takes.")
+                text = "Started no workers: this process did it in less than a batch takes."
+                done.decisions.append(skipped(text, "workers"))
                 return done
         executor = open_executor(settings, folder)
         sharing = _Sharing(works, executor, settings, progress)
@@ -89,7 +91,7 @@ def _done_here(works: Sequence[Work], settings: ExecutionConfig, progress: Meter
         for items in work.passes:
             while items:
                 batch = tuple(items[:count])
-                answer = run_batch(Batch(number=0, job=work.job, stage=work.stage, key=work.key, items=batch))
+                answer = run_batch(work.batch(0, batch))
                 answer.raise_error()
                 del items[: len(batch)]
                 progress.advance(sum(len(work.views[i]) for i in batch))
@@ -135,7 +137,7 @@ class _Sharing:
             items = [queue.popleft() for _ in range(self._batch_size(len(queue), workers))]
             work = self.works[chosen]
             self.number += 1
-            batch = Batch(number=self.number, job=work.job, stage=work.stage, key=work.key, items=tuple(items))
+            batch = work.batch(self.number, items)
             self.out[self.number] = _Out(chosen, batch, deque(items), time.monotonic())
             self.executor.submit(batch)
 
@@ -197,7 +199,7 @@ class _Sharing:
         undone = [i for i in out.left if not work.finished(i)]
         self.progress.advance(sum(len(work.views[i]) for i in set(out.left) - set(undone)))
         sentence = f"A worker {why}; its {len(undone)} unfinished items of {work.stage} were handed to another."
-        self.totals.decisions.append(sentence)
+        self.totals.decisions.append(warning(sentence))
         if not undone:
             return
         culprit = out.work, undone[0]

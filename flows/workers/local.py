@@ -16,8 +16,6 @@ import torch
 from flows.workers.work import Answer, Batch
 from schemas.config import ExecutionConfig
 
-STOP_TIMEOUT_S = 5.0
-
 
 class LocalExecutor:
     """Starts workers as they are needed, and new ones for those that die. Batches and answers are lines of JSON."""

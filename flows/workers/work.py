@@ -1,21 +1,17 @@
-"""Units of work that can be done anywhere: a batch of a stage's items, and what came of it. JSON in, JSON out.
-
-A stage that fans out has `work(job, store, key, items)`, which does the items that aren't done yet, one after another.
-"""
+"""Units of work that can be done anywhere: a batch of a stage's items, and what came of it. JSON in, JSON out."""
 
 from __future__ import annotations
 
-import importlib
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ImportString
 
-from cat3d_core.zipnerf import NonFiniteError
+from cat3d_core.reconstruction import NonFiniteError
 from flows.errors import InputError, WorkerError
-from flows.generation.model import cpu_threads, shared_model
-from flows.pipeline.jobs import Job
+from flows.jobs.device import cpu_threads
+from flows.jobs.job import Job
 from schemas.errors import ConfigError, StoreError
 from schemas.scene_store import SceneStore, Section
 
@@ -23,8 +19,14 @@ from schemas.scene_store import SceneStore, Section
 KNOWN_ERRORS = {e.__name__: e for e in (InputError, ConfigError, StoreError, WorkerError, NonFiniteError)}
 
 
+#: What a worker loads before its first item, and keeps.
+Load = Callable[[Job], object]
+#: Does the items that aren't done yet, one after another.
+Share = Callable[[Job, SceneStore, str, Sequence[int]], None]
+
+
 class Batch(BaseModel):
-    """Items of one stage of one job, for one worker."""
+    """Items of one stage of one job, for one worker; load and share are sent as the names of the functions."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -33,6 +35,8 @@ class Batch(BaseModel):
     stage: str
     key: str
     items: tuple[int, ...]
+    load: ImportString[Load]
+    share: ImportString[Share]
 
 
 class Answer(BaseModel):
@@ -56,10 +60,10 @@ def run_batch(batch: Batch) -> Answer:
     started = loaded = time.monotonic()
     try:
         with cpu_threads(batch.job.config.execution.threads):
-            shared_model(batch.job)
+            batch.load(batch.job)
             loaded = time.monotonic()
             store = SceneStore.open(batch.job.store_path, "r+")
-            importlib.import_module(f"flows.stages.{batch.stage}").work(batch.job, store, batch.key, batch.items)
+            batch.share(batch.job, store, batch.key, batch.items)
     except Exception as error:
         kind = next((name for name, known in KNOWN_ERRORS.items() if isinstance(error, known)), type(error).__name__)
         message = str(error) if kind in KNOWN_ERRORS else traceback.format_exc()
@@ -82,17 +86,25 @@ def is_done(section: Section, marker: str, view: int, key: str, data: str | None
 class Work:
     """One stage of one job to be shared out: items (groups, views) in passes, one pass after another.
 
+    load, share: functions of a module (not of another function), as a worker finds them by name.
     views: the views each item makes; their content keys in `marker` say what is done, and `data` is read to make sure.
     """
 
     def __init__(
-        self, job: Job, stage: str, key: str, section: Section, marker: str, data: str, keys: Sequence[str],
-        passes: Sequence[Sequence[int]], views: Sequence[Sequence[int]],
+        self, job: Job, stage: str, key: str, load: Load, share: Share, section: Section, marker: str, data: str,
+        keys: Sequence[str], passes: Sequence[Sequence[int]], views: Sequence[Sequence[int]],
     ) -> None:  # fmt: skip
-        self.job, self.stage, self.key = job, stage, key
+        self.job, self.stage, self.key, self.load, self.share = job, stage, key, load, share
         self.section, self.marker, self.data, self.keys = section, marker, data, list(keys)
         self.views = views
         self.passes = [self.missing(items) for items in passes]
+
+    def batch(self, number: int, items: Sequence[int]) -> Batch:
+        """Some of the items, to be sent to a worker."""
+        return Batch(
+            number=number, job=self.job, stage=self.stage, key=self.key, items=tuple(items), load=self.load,
+            share=self.share,
+        )  # fmt: skip
 
     def missing(self, items: Sequence[int]) -> list[int]:
         """Those of the items that have a view which isn't there whole and marked as done. Reads the data."""

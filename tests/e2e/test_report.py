@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from flows.reporting.charts import Point, Series, chart, log_ticks, ticks
+from flows.reporting.metric_table import metric_table
 from flows.reporting.published import PUBLISHED
 from flows.reporting.report import write_report
 from flows.reporting.summary import paper_tables, summary_rows, timing_rows
-from schemas.tables import METRICS, TIMINGS, append_rows
+from schemas.tables import TIMINGS, append_rows
 from tests.flows.conftest import ROOT, SCENE, TINY, command, environment, prefect_url  # noqa: F401
 
 
@@ -85,7 +86,7 @@ def test_sliders_and_wide_tables_work_in_a_real_browser(page: Path, tmp_path: Pa
 def test_an_identical_render_and_empty_columns_do_not_break_the_page(tmp_path: Path) -> None:
     row = {"scene_id": "a", "run": "v3-zipnerf", "key": "k", "protocol": "google", "view": 0, "width": 8, "height": 8,
            "psnr_db": float("inf"), "ssim": 1.0, "dataset": "llff", "method": "zipnerf", "split": "3"}  # fmt: skip
-    append_rows(tmp_path / "metrics", METRICS, [row], "a")
+    append_rows(tmp_path / "metrics", metric_table(), [row], "a")
     text = write_report(tmp_path).read_text()
     assert "<td>inf</td>" in text
     assert "| inf | 1.000 | - | - |" in (tmp_path / "report.md").read_text()
@@ -100,7 +101,7 @@ def test_papers_layout_has_its_rows_apart_from_ours(tmp_path: Path) -> None:
     values = {("a", "3"): 20.0, ("b", "3"): 22.0, ("a", "all"): 30.0}
     for (scene, split), psnr in values.items():
         run = {"scene_id": scene, "run": f"v{split}-zipnerf", "method": "zipnerf", "split": split, "psnr_db": psnr}
-        append_rows(tmp_path / "metrics", METRICS, [base | run | {"ssim": psnr / 40}], f"{scene}{split}")
+        append_rows(tmp_path / "metrics", metric_table(), [base | run | {"ssim": psnr / 40}], f"{scene}{split}")
     [table] = paper_tables(summary_rows(tmp_path))
     assert table["splits"] == ["3", "all"]
     *published, ours = table["datasets"][0]["rows"]

@@ -38,10 +38,7 @@ def test_a_config_goes_through_json_and_back() -> None:
         ("seed: 1.5", "seed is 1.5, but input should be a valid integer"),
         ("ingest: {downscale: 0}", "ingest.downscale is 0, but input should be greater than or equal to 1"),
         ("sample: {guidance: .nan}", "sample.guidance is nan, but input should be a finite number"),
-        (
-            "reconstruct: {preset: slow}",
-            "reconstruct.preset is 'slow', but input should be 'tiny', 'fast', 'balanced' or",
-        ),
+        ("render: {path: slow}", "render.path is 'slow', but input should be 'none' or 'auto'"),
         ("plan: 3", "plan is 3, but input should be"),
         ("- 1", "should hold fields and values, not list"),
         ("seed: [1", "is not valid YAML"),

@@ -11,10 +11,10 @@ import pytest
 import zarr
 
 from schemas import arrays
-from schemas.documents import read_metadata
+from schemas.documents import nodes, read_metadata
 from schemas.errors import MissingError, StoreError
 from schemas.scene_store import SceneStore
-from schemas.verify import nodes, verify
+from schemas.verify import verify
 
 #: One array of every kind in the fixture's store.
 ARRAYS = {

@@ -266,7 +266,7 @@ def _nan(path: Path) -> None:
         (_nan, "the token NaN is not JSON"),
         (_rootless, "is half-written: its zarr.json is missing"),
         (_groupless, "is half-written or damaged: its group 'latents' is missing"),
-        (lambda p: _edit(p, schema_version=99), "schema version 99, and this cat3d knows those up to 1: update cat3d"),
+        (lambda p: _edit(p, schema_version=99), "schema version 99, and this cat3d knows those up to 2: update cat3d"),
         (lambda p: _edit(p, schema_version="1"), "its schema_version is '1'"),
         (lambda p: _edit(p, schema_version=None), "its schema_version is None"),
         (lambda p: _edit(p, schema_version=0), "older schema version 0"),

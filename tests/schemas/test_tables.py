@@ -12,7 +12,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from schemas.errors import StoreError
-from schemas.tables import METRICS, TIMINGS, append_rows, read_rows
+from schemas.tables import TIMINGS, append_rows, column, metrics_schema, read_rows
+
+METRICS = metrics_schema(
+    [
+        column("psnr_db", pa.float64(), "peak signal-to-noise ratio", "dB"),
+        column("ssim", pa.float64(), "structural similarity", "1"),
+    ]
+)
 
 
 def metric(view: int, **values: Any) -> dict[str, Any]:

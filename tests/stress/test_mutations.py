@@ -18,9 +18,10 @@ import typer
 from cat3d_core import alignment, cameras, splines
 from cat3d_core.diffusion import guidance, schedule, solvers
 from cat3d_core.metrics import psnr, ssim
+from cat3d_core.reconstruction import render as image_render
 from cat3d_core.splats import density, reference
 from cat3d_core.stress import ROUTINES, stress
-from cat3d_core.zipnerf import adam, coordinates, field, frustums, hash_grid, losses, render, stepfun
+from cat3d_core.zipnerf import adam, coordinates, frustums, gradients, grid_reference, losses, render, stepfun
 from flows.commands.stress import QUICK_CASES, stress_command
 
 
@@ -127,17 +128,17 @@ MUTATIONS: dict[str, tuple[Callable[..., Any], dict[str, str], str]] = {
         "frustums.perpendicular_basis",
     ),
     "density without cap": (
-        field._SafeExp.forward,
+        gradients._SafeExp.forward,
         {"x.clamp_max(_LOG_DENSITY_MAX).exp()": "x.exp()"},
         "field.safe_exp",
     ),
     "step lengths squared and multiplied": (
-        render.normals_from_depth,
+        image_render.normals_from_depth,
         {"torch.linalg.cross(tangent(0), tangent(1))": "torch.linalg.cross(tangent(0) * 1e12, tangent(1) * 1e12)"},
         "render.normals_from_depth",
     ),
     "corners outside the grid": (
-        hash_grid._corner,
+        grid_reference._corner,
         {"inside = (x >= 0)": "inside = (x >= -1)"},
         "hash_grid.query_reference[dense]",
     ),

@@ -21,8 +21,9 @@ from cat3d_core.metrics.ssim import ssim
 from cat3d_core.normalization import Similarity, normalize_scene
 from cat3d_core.plan import PlanConfig, make_plan
 from cat3d_core.rays import Rays, image_rays, raymap
-from cat3d_core.zipnerf import PRESETS, Field, Trainer, Views, losses, render_image
-from cat3d_core.zipnerf.field import safe_exp
+from cat3d_core.reconstruction import Views
+from cat3d_core.zipnerf import PRESETS, Field, Trainer, losses, render_image
+from cat3d_core.zipnerf.gradients import safe_exp
 from cat3d_core.zipnerf.render import Round, expected_depth, render_rays, weights_from_density
 from tests.core.diffusion.models import random_model
 
@@ -187,7 +188,7 @@ def test_empty_and_solid_fields_render_and_learn(bias: float, far: float) -> Non
 def _views(cameras: Cameras, *levels: int) -> Views:
     sizes = cameras.size.tolist()
     images = [torch.full((h, w, 3), level, dtype=torch.uint8) for level, (w, h) in zip(levels, sizes, strict=True)]
-    return Views(cameras, images, torch.ones(len(levels), dtype=torch.bool))
+    return Views.from_images(cameras, images, torch.ones(len(levels), dtype=torch.bool))
 
 
 def _train(views: Views, steps: int = 40, **changes: object) -> Trainer:

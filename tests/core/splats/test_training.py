@@ -11,6 +11,8 @@ from torch import Tensor
 from cat3d_core.cameras import Cameras
 from cat3d_core.normalization import normalize_scene
 from cat3d_core.rays import image_rays
+from cat3d_core.reconstruction.render import Render, normals_from_depth
+from cat3d_core.reconstruction.views import Views
 from cat3d_core.splats.config import PRESETS, REFINE, SplatConfig
 from cat3d_core.splats.from_renders import from_renders
 from cat3d_core.splats.gaussians import Gaussians
@@ -20,8 +22,6 @@ from cat3d_core.splats.trainer import SplatTrainer, expand, train
 from cat3d_core.synthetic import random_cameras, random_scene, trace
 from cat3d_core.zipnerf.coordinates import contract
 from cat3d_core.zipnerf.losses import view_weights
-from cat3d_core.zipnerf.render import Render, normals_from_depth
-from cat3d_core.zipnerf.views import Views
 
 pytestmark = pytest.mark.skipif(not available(), reason="There is no C++ compiler here.")
 SHORT = dataclasses.replace(PRESETS["tiny"], iterations=60, start=1500, most=2000)
@@ -36,7 +36,7 @@ def scene() -> tuple[Views, Views]:
     cameras = normalize_scene(cameras).cameras(cameras)
 
     def views(rows: list[int]) -> Views:
-        return Views(cameras[rows], [images[i] for i in rows], torch.ones(len(rows), dtype=torch.bool))
+        return Views.from_images(cameras[rows], [images[i] for i in rows], torch.ones(len(rows), dtype=torch.bool))
 
     return views([i for i in range(14) if i not in (4, 10)]), views([4, 10])
 
@@ -91,7 +91,7 @@ def test_masked_pixels_teach_nothing(scene: tuple[Views, Views]) -> None:
             image[:, :10] = shown
             images.append(image)
             masks.append(mask)
-        covered = Views(views.cameras, images, views.captured, masks)
+        covered = Views.from_images(views.cameras, images, views.captured, masks)
         first = SplatTrainer(SHORT, views, 0).gaussians
         found.append(train(SplatTrainer(dataclasses.replace(SHORT, iterations=6), covered, 0, first=first)))
     for name, value in found[0].tensors().items():
@@ -103,7 +103,7 @@ def test_far_generated_views_count_less(scene: tuple[Views, Views]) -> None:
     views, _ = scene
     captured = torch.zeros(len(views), dtype=torch.bool)
     captured[0] = True
-    some = Views(views.cameras, [views.image(i) for i in range(len(views))], captured)
+    some = Views.from_images(views.cameras, [views.image(i) for i in range(len(views))], captured)
     trainer = SplatTrainer(dataclasses.replace(SHORT, background=(0.5, 0.5)), some, 0)
 
     def loss(view: int) -> float:

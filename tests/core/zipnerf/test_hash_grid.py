@@ -9,15 +9,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from cat3d_core.zipnerf import hash_grid, hash_grid_cpu
-from cat3d_core.zipnerf.hash_grid import level_weights, make_layout, query_reference
+from cat3d_core.zipnerf import hash_grid_cpu
+from cat3d_core.zipnerf.grid_layout import GridLayout, make_layout
+from cat3d_core.zipnerf.grid_reference import level_weights, query_reference
 
 needs_compiler = pytest.mark.skipif(not hash_grid_cpu.available(), reason="There is no C++ compiler here.")
 
 
-def _inputs(
-    layout: hash_grid.GridLayout, count: int, samples: int = 6
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _inputs(layout: GridLayout, count: int, samples: int = 6) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     table = torch.randn((layout.rows, layout.features), generator=generator)
     centres = torch.rand((count, 1, 3), generator=generator) * 1.04 - 0.02  # also outside the cube
@@ -135,7 +134,7 @@ def test_cpu_kernel_refuses_what_it_cannot_do() -> None:
 def test_without_compiler_the_reference_runs_with_one_warning(tmp_path: Path) -> None:
     code = (
         "import torch, warnings\n"
-        "from cat3d_core.zipnerf.hash_grid import make_layout, query\n"
+        "from cat3d_core.zipnerf.grid_layout import make_layout\nfrom cat3d_core.zipnerf.hash_grid import query\n"
         "layout = make_layout(4, 8, 8, 1)\n"
         "with warnings.catch_warnings(record=True) as caught:\n"
         "    warnings.simplefilter('always')\n"

@@ -15,7 +15,8 @@ needs_triton = pytest.mark.skipif(importlib.util.find_spec("triton") is None, re
 def compare(device: str) -> None:
     """Forward, backward in both modes, on dense and hashed levels, against float64; and determinism."""
     from cat3d_core.zipnerf import hash_grid_triton
-    from cat3d_core.zipnerf.hash_grid import make_layout, query_reference
+    from cat3d_core.zipnerf.grid_layout import make_layout
+    from cat3d_core.zipnerf.grid_reference import query_reference
 
     for features, samples in ((1, 6), (4, 3)):
         layout = make_layout(16, 64, 12, features)

@@ -8,17 +8,12 @@ import torch
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.rays import image_rays
-from cat3d_core.zipnerf import PRESETS, Field, NonFiniteError, Trainer, Views, losses, render_image
+from cat3d_core.reconstruction import NonFiniteError, Views, draw_batch, normals_from_depth
+from cat3d_core.zipnerf import PRESETS, Field, Trainer, losses, render_image
 from cat3d_core.zipnerf.adam import Adam
-from cat3d_core.zipnerf.field import encode_directions, safe_exp
-from cat3d_core.zipnerf.render import (
-    Round,
-    near_gradient_scale,
-    normals_from_depth,
-    render_rays,
-    weights_from_density,
-)
-from cat3d_core.zipnerf.views import draw_batch
+from cat3d_core.zipnerf.field import encode_directions
+from cat3d_core.zipnerf.gradients import safe_exp
+from cat3d_core.zipnerf.render import Round, near_gradient_scale, render_rays, weights_from_density
 
 TINY = dataclasses.replace(PRESETS["tiny"], iterations=30, warmup_iterations=3, batch_rays=256)
 
@@ -52,7 +47,7 @@ def _views(count: int = 4, captured: int | None = None) -> Views:
         rgb = torch.where((root > 0)[:, None], 0.5 + point / 0.6, 0.6)
         images.append((rgb.clamp(0, 1) * 255).to(torch.uint8).view(20, 24, 3))
     flags = torch.arange(count) < (count if captured is None else captured)
-    return Views(cameras, images, flags)
+    return Views.from_images(cameras, images, flags)
 
 
 def test_thin_fog_keeps_its_weight() -> None:
@@ -159,7 +154,7 @@ def test_normals_of_a_plane_face_the_camera() -> None:
 def test_patches_lie_inside_mixed_sizes_and_captured_views_are_emphasised() -> None:
     cameras = Cameras.cat([_cameras(1, 24, 20), _cameras(1, 17, 30), _cameras(1, 40, 16)])
     images = [torch.full((int(h), int(w), 3), i, dtype=torch.uint8) for i, (w, h) in enumerate(cameras.size)]
-    views = Views(cameras, images, torch.tensor([True, False, False]))
+    views = Views.from_images(cameras, images, torch.tensor([True, False, False]))
     batch = draw_batch(views, 400, 16, 0.8, torch.Generator().manual_seed(0))
     size = views.size[batch.view]
     assert (batch.xy >= 0).all()
@@ -195,9 +190,9 @@ def test_views_name_the_view_that_does_not_fit() -> None:
     cameras = _cameras(2)
     good = torch.zeros((20, 24, 3), dtype=torch.uint8)
     with pytest.raises(ValueError, match="view 1"):
-        Views(cameras, [good, good[:10]], torch.ones(2, dtype=torch.bool))
+        Views.from_images(cameras, [good, good[:10]], torch.ones(2, dtype=torch.bool))
     with pytest.raises(ValueError, match="mask of view 0"):
-        Views(cameras, [good, good], torch.ones(2, dtype=torch.bool), [good[:3, :, 0] > 0, None])
+        Views.from_images(cameras, [good, good], torch.ones(2, dtype=torch.bool), [good[:3, :, 0] > 0, None])
 
 
 def test_training_learns_and_is_identical_for_a_seed_and_after_resume() -> None:
@@ -257,7 +252,7 @@ def test_masked_pixels_do_not_count() -> None:
     views = _views(2)
     black = [torch.zeros(20, 24, dtype=torch.bool)] * 2
     images = [views.pixels[i * 480 : (i + 1) * 480].view(20, 24, 3) for i in range(2)]
-    trainer = Trainer(TINY, Views(views.cameras, images, views.captured, black), seed=0)
+    trainer = Trainer(TINY, Views.from_images(views.cameras, images, views.captured, black), seed=0)
     assert trainer.step()["photometric"] == 0
 
 

@@ -18,10 +18,11 @@ from flows.commands.reprocess import clone_path, expected_costs, find_stale, mak
 from flows.errors import InputError
 from flows.media import images
 from flows.pipeline.sweep import run_sweep
+from flows.reporting.metric_table import metric_table
 from flows.reporting.summary import timing_rows
 from schemas.config import SweepConfig, parse_config
 from schemas.scene_store import SceneStore
-from schemas.tables import METRICS, read_rows
+from schemas.tables import read_rows
 from tests.flows.pipeline.test_sweep import BASE
 from tests.flows.workers.scene import random_model
 
@@ -249,12 +250,14 @@ def test_clip_weights_make_only_the_evaluation_stale(root: Path, monkeypatch, pr
         state[f"visual.{key}"] = value
     out, run = root / "out", "v3-zipnerf"
     save_file(state, root / "clip.safetensors")
-    assert all(row["clip_score"] is None for row in read_rows(out / "metrics", METRICS).to_pylist())
-    assert any("No CLIP weights" in d for d in SceneStore.open(out / "room.zarr").record("evaluate", run).decisions)
+    assert all(row["clip_score"] is None for row in read_rows(out / "metrics", metric_table()).to_pylist())
+    assert any(
+        "No CLIP weights" in d.text for d in SceneStore.open(out / "room.zarr").record("evaluate", run).decisions
+    )
     monkeypatch.setenv("CAT3D_CLIP_WEIGHTS", str(root / "clip.safetensors"))
     assert stale_of(out) == every(["evaluate"], ["evaluate"])
     redo(find_stale(out)[0])
-    for row in read_rows(out / "metrics", METRICS).to_pylist():
+    for row in read_rows(out / "metrics", metric_table()).to_pylist():
         assert -1 <= row["clip_score"] <= 1
         assert row["clip_network"].startswith("clip-vit-64x1/8-16-quickgelu ")
 
@@ -264,7 +267,7 @@ def test_old_results_stay_until_the_new_are_complete(root: Path, monkeypatch, pr
     where = {"method": "zipnerf"}
     images.write_png(root / "room" / "images" / "0002.png", np.full((20, 24, 3), 90, np.uint8))
     old_image = SceneStore.open(out / "room.zarr").captured.read("image")
-    old_rows = read_rows(out / "metrics", METRICS).to_pylist()
+    old_rows = read_rows(out / "metrics", metric_table()).to_pylist()
     from flows.stages import render
 
     execute = render.execute
@@ -281,14 +284,14 @@ def test_old_results_stay_until_the_new_are_complete(root: Path, monkeypatch, pr
     store = SceneStore.open(out / "room.zarr")
     assert np.array_equal(store.captured.read("image"), old_image)
     assert store.record("evaluate", "v3-zipnerf") is not None
-    assert read_rows(out / "metrics", METRICS).to_pylist() == old_rows
+    assert read_rows(out / "metrics", metric_table()).to_pylist() == old_rows
     assert all(p.read_bytes() == data for p, data in pictures.items())
     monkeypatch.undo()
     assert stale_of(out, where=where) == {"v6-zipnerf": FITTED[1:]}, "it goes on in the clone"
     redo(find_stale(out, where=where)[0])
     assert [p.name for p in out.glob(".*reprocess*")] == []
     keys = {run: SceneStore.open(out / "room.zarr").record("evaluate", run).key for run in PLAIN_RUNS}
-    rows = [r for r in read_rows(out / "metrics", METRICS).to_pylist() if r["run"] in PLAIN_RUNS]
+    rows = [r for r in read_rows(out / "metrics", metric_table()).to_pylist() if r["run"] in PLAIN_RUNS]
     assert all(r["key"] == keys[r["run"]] for r in rows)
     assert len(rows) == sum(r["run"] in PLAIN_RUNS for r in old_rows)
     assert any(p.read_bytes() != data for p, data in pictures.items())

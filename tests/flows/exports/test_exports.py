@@ -21,9 +21,9 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.metrics.geometry import nearest_distances
 from cat3d_core.normalization import Similarity
 from cat3d_core.rays import image_rays
+from cat3d_core.reconstruction import Render, normals_from_depth, point_cloud, surface_depth
 from cat3d_core.synthetic.capture import look_at
-from cat3d_core.zipnerf import PRESETS, Field, Render, point_cloud, render_ladder, surface_depth
-from cat3d_core.zipnerf.render import normals_from_depth
+from cat3d_core.zipnerf import PRESETS, Field, render_ladder
 from flows.bench.geometry import mesh_row, sample_surface, true_depths
 from flows.bench.reconstruct import procedural_views
 from flows.cli import app
@@ -36,7 +36,7 @@ from flows.exports.path import read_path
 from flows.exports.ply import write_ply
 from flows.exports.source import open_source, training_images
 from flows.media.images import read_image
-from flows.pipeline.scene import ensure_store, execute_stage, prepare_run
+from flows.pipeline.runner import opened, run_missing
 from flows.readers import read_capture
 from schemas.scene_store import SceneStore
 
@@ -262,16 +262,13 @@ OVERRIDES = (
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with a field and a rendered path, made without a server."""
-    from flows.pipeline.jobs import expected_steps, make_jobs
+    from flows.jobs.job import Request
 
     out = tmp_path_factory.mktemp("exports")
     config = make_config({"method": "zipnerf", "preset": "fast"}, None, [OVERRIDES, "render.path_views=2"])
-    capture, [job] = make_jobs("procedural:co3d/1?views=10&width=32&height=24", out, ["all"], config)
-    ensure_store(job, capture)
-    prepare_run(job, capture)
-    steps = expected_steps(job, capture)
-    for stage in ("ingest", "poses", "reconstruct", "render"):
-        execute_stage(job, steps[stage])
+    [job] = Request("procedural:co3d/1?views=10&width=32&height=24", out, ("all",), config).jobs()
+    with opened(job):
+        run_missing(job, until="render")
     return job.store_path
 
 

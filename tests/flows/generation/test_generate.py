@@ -13,8 +13,9 @@ from cat3d_core.sample_sets import source_boxes
 from flows.commands.run import make_config
 from flows.errors import InputError
 from flows.generation.groups import StoredPlan
+from flows.jobs.job import Job, Request
 from flows.media.images import PADDING, read_image, square_image
-from flows.pipeline.jobs import Job, expected_steps, make_jobs, pending
+from flows.pipeline.keys import pending
 from flows.stages.training_views import generated_views, no_finer
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
@@ -75,14 +76,13 @@ def test_the_plan_is_printed_drawn_and_stored_before_anything_is_sampled(model: 
     assert run.generated.names() == []
     picture, _ = read_image(job.pictures / "plan.png")
     assert picture.shape[1] > 800
-    capture = job.capture()
-    assert [s.stage for s in pending(job, expected_steps(job, capture))][0] == "encode", "a run goes on from here"
+    assert [s.stage for s in pending(job)][0] == "encode", "a run goes on from here"
 
 
 def test_settings_that_cannot_be_planned_end_in_a_sentence(model: Path, tmp_path: Path) -> None:
     def job(*settings: str) -> Job:
         texts = ["method=cat3d", f"sample.checkpoint={model}", *settings]
-        return make_jobs(SCENE, tmp_path, ["3"], make_config({}, None, texts))[1][0]
+        return Request(SCENE, tmp_path, ("3",), make_config({}, None, texts)).jobs()[0]
 
     with pytest.raises(ConfigError, match="no trajectory 'circle'"):
         prepare(job("plan.trajectory=circle"))
@@ -95,7 +95,7 @@ def test_settings_that_cannot_be_planned_end_in_a_sentence(model: Path, tmp_path
 def test_wide_samples_are_planned_encoded_and_kept_without_their_padding(model: Path, tmp_path: Path) -> None:
     texts = ["method=cat3d", f"sample.checkpoint={model}", "plan.views=5", "plan.wide=true", "sample.steps=3"]
     texts.append("execution.workers=1")
-    job = make_jobs(SCENE, tmp_path, ["3"], make_config({}, None, texts))[1][0]
+    job = Request(SCENE, tmp_path, ("3",), make_config({}, None, texts)).jobs()[0]
     prepare(job)
     store = SceneStore.open(job.store_path)
     plan = StoredPlan(store, store.run(job.run), 0)

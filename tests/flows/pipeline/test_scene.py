@@ -14,9 +14,11 @@ import numpy as np
 import pytest
 
 from flows.commands.run import make_config
-from flows.pipeline.jobs import expected_steps, make_jobs, pending
+from flows.jobs.job import Request
+from flows.pipeline.keys import pending
+from flows.reporting.metric_table import metric_table
 from schemas.scene_store import SceneStore
-from schemas.tables import METRICS, TIMINGS, read_rows
+from schemas.tables import TIMINGS, read_rows
 from tests.flows.conftest import ROOT, SCENE, TINY, command, environment
 
 RUN = "v3-zipnerf"
@@ -49,7 +51,7 @@ def test_one_command_leaves_a_store_metrics_pictures_and_a_report(finished: Path
     store = store_of(finished)
     assert [s for s in STAGES if store.record(s, RUN)] == STAGES
     assert store.captured.read("image").shape == (9, 24, 32, 3)
-    rows = read_rows(finished / "metrics", METRICS).to_pylist()
+    rows = read_rows(finished / "metrics", metric_table()).to_pylist()
     assert sorted(r["view"] for r in rows) == [0, 8]
     assert all(r["protocol"] == "google" and 5 < r["psnr_db"] < 60 and r["ssim"] <= 1 for r in rows)
     pictures = {p.name for p in (finished / "procedural_dtu_3" / RUN).iterdir()}
@@ -64,8 +66,8 @@ def test_one_command_leaves_a_store_metrics_pictures_and_a_report(finished: Path
 
 
 def test_poses_in_the_store_are_normalised_and_invertible(finished: Path) -> None:
+    from flows.jobs.access import read_cameras, read_similarity
     from flows.readers.base import read_capture
-    from flows.stages.common import read_cameras, read_similarity
 
     store = store_of(finished)
     back = read_similarity(store).inverse().cameras(read_cameras(store.captured))
@@ -96,8 +98,7 @@ def test_a_changed_setting_makes_exactly_its_stages_stale(finished: Path, change
         settings.append(change[1])
     else:
         given["downscale"] = int(change[1])
-    capture, jobs = make_jobs(SCENE, finished, ["3"], make_config(given, None, settings))
-    steps = pending(jobs[0], expected_steps(jobs[0], capture))
+    steps = pending(Request(SCENE, finished, ("3",), make_config(given, None, settings)).jobs()[0])
     assert [s.stage for s in steps] == stale
     assert all("changed" in s.why for s in steps)
 
@@ -202,9 +203,9 @@ def test_bad_requests_end_in_a_sentence_and_an_exit_code(
 
 
 def test_auto_generates_views_for_a_single_photo_only(tmp_path: Path) -> None:
-    _, jobs = make_jobs(SCENE, tmp_path, ["1", "3", "all"], make_config({}, None, []))
+    jobs = Request(SCENE, tmp_path, ("1", "3", "all"), make_config({}, None, [])).jobs()
     assert [j.run for j in jobs] == ["v1-cat3d", "v3-zipnerf", "vall-zipnerf"]
-    _, asked = make_jobs(SCENE, tmp_path, ["3"], make_config({"method": "cat3d"}, None, []))
+    asked = Request(SCENE, tmp_path, ("3",), make_config({"method": "cat3d"}, None, [])).jobs()
     assert asked[0].run == "v3-cat3d"
 
 
@@ -218,7 +219,7 @@ def test_the_sampler_is_the_runs_own_else_the_models_else_the_measured_default(t
 
     def chosen(name: str, *settings: str) -> dict:
         given = {"method": "cat3d", "model": str(tmp_path / f"{name}.safetensors")}
-        return sampler_settings(make_jobs(SCENE, tmp_path, ["3"], make_config(given, None, settings))[1][0])
+        return sampler_settings(Request(SCENE, tmp_path, ("3",), make_config(given, None, settings)).jobs()[0])
 
     skipped = {"guidance_log_snr": [None, 2.0], "near_steps": False}
     assert chosen("plain") == SAMPLER_DEFAULT | skipped

@@ -13,9 +13,10 @@ from typer.testing import CliRunner
 from flows.cli import app
 from flows.commands.results import compare
 from flows.pipeline.sweep import open_jobs, run_sweep, sweep_jobs
+from flows.reporting.metric_table import metric_table
 from schemas.config import SceneSource, SweepConfig, parse_config
 from schemas.settings import merged
-from schemas.tables import METRICS, TIMINGS, append_rows, read_rows
+from schemas.tables import TIMINGS, append_rows, read_rows
 from tests.flows.conftest import ROOT, command, environment
 from tests.flows.workers.scene import random_model
 
@@ -46,7 +47,7 @@ def test_a_failed_scene_does_not_stop_the_rest_and_a_rerun_does_nothing(tmp_path
     assert any("transforms.json" in p for p in problems)
     assert any("set the environment variable CAT3D_NOT_SET" in p for p in problems)
     assert any("no split for 9 views" in p for p in problems)
-    rows = read_rows(tmp_path / "out" / "metrics", METRICS).to_pylist()
+    rows = read_rows(tmp_path / "out" / "metrics", metric_table()).to_pylist()
     assert {r["run"] for r in rows} == {"v3-zipnerf"}
     before = stages_run(tmp_path / "out")
     run_sweep(config, tmp_path / "out")
@@ -91,7 +92,7 @@ def test_results_name_regressions_beyond_the_bound(tmp_path: Path) -> None:
            "psnr_db": 20.0, "ssim": 0.5, "lpips": 0.3, "lpips_backbone": "lpips-vgg", "method": "zipnerf"}  # fmt: skip
     for name, changes in {"old": {}, "worse": {"psnr_db": 19.8}, "fine": {"psnr_db": 19.95, "ssim": 0.6},
                           "other": {"lpips": 0.9, "lpips_backbone": "st-lpips-alex"}}.items():  # fmt: skip
-        append_rows(tmp_path / name / "metrics", METRICS, [row | changes], "a")
+        append_rows(tmp_path / name / "metrics", metric_table(), [row | changes], "a")
     assert compare(tmp_path / "worse", tmp_path / "old", 0.1, 0.01) == 1
     assert compare(tmp_path / "fine", tmp_path / "old", 0.1, 0.01) == 0
     assert compare(tmp_path / "other", tmp_path / "old", 0.1, 0.01) == 0
@@ -101,7 +102,7 @@ def test_results_command_exits_1_on_a_regression_only(tmp_path: Path) -> None:
     row = {"scene_id": "a", "run": "v3-zipnerf", "key": "k", "protocol": "google", "view": 0, "width": 8, "height": 8,
            "psnr_db": 20.0, "ssim": 0.5, "method": "zipnerf"}  # fmt: skip
     for name, psnr in {"old": 20.0, "worse": 19.8}.items():
-        append_rows(tmp_path / name / "metrics", METRICS, [row | {"psnr_db": psnr}], "a")
+        append_rows(tmp_path / name / "metrics", metric_table(), [row | {"psnr_db": psnr}], "a")
     old, worse = str(tmp_path / "old"), str(tmp_path / "worse")
     for arguments, code in {(old,): 0, (worse, "--against", old): 1, (old, "--against", worse): 0,
                             (worse, "--against", old, "--bound", "0.5"): 0}.items():  # fmt: skip
@@ -156,6 +157,6 @@ def test_a_sweep_killed_at_any_moment_ends_with_the_results_of_an_undisturbed_on
             kills += 1
     subprocess.run(arguments["b"], cwd=ROOT, env=environment(), check=True, capture_output=True)
     assert kills >= 1
-    a, b = (read_rows(tmp_path / name / "metrics", METRICS).to_pylist() for name in "ab")
+    a, b = (read_rows(tmp_path / name / "metrics", metric_table()).to_pylist() for name in "ab")
     assert len(a) == 2 * 2 * 2 * 2, "scenes, splits, methods, held-out views"
     assert a == b

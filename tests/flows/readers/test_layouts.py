@@ -262,7 +262,7 @@ def test_procedural_images_match_their_cameras():
 
 
 def test_procedural_views_are_known_without_rendering_them(monkeypatch):
-    from flows.pipeline.jobs import capture_digests
+    from flows.jobs.scene import capture_digests
 
     monkeypatch.setattr("flows.readers.procedural.trace", None)
     one, other = (read_capture(f"procedural:dtu/{seed}?views=4&width=24&height=16") for seed in (51, 52))

@@ -11,22 +11,27 @@ import torch
 from cat3d_core.cameras import Cameras
 from cat3d_core.diffusion import GuidanceConfig, SamplerConfig, sample
 from cat3d_core.plan import PlanConfig, make_plan
-from cat3d_core.zipnerf import ReconstructConfig, Trainer, Views
+from cat3d_core.reconstruction import Views
+from cat3d_core.zipnerf import Trainer, ZipNerfConfig
+from cat3d_core.zipnerf.settings import config_from_document, fitted, left_out
 from flows.commands.run import make_config
 from flows.generation.groups import StoredPlan
 from flows.generation.model import shared_model
+from flows.jobs.access import read_cameras, read_images
+from flows.jobs.job import Job, Request
 from flows.media.images import to_uint8
-from flows.pipeline.jobs import Job, expected_steps, make_jobs
+from flows.pipeline.keys import expected_steps
+from flows.reconstruction.open import open_reconstructor
+from flows.reconstruction.stored import read_reconstruction
 from flows.reporting.inspect import inspect_store
 from flows.stages import sample as sample_stage
-from flows.stages.common import read_cameras, read_images
-from flows.stages.reconstruct import fitted, read_field, trainer_config
 from flows.stages.sample import group_sampler, network_inputs
 from flows.stages.training_views import generated_views, training_views
 from schemas.config import parse_config
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
 from schemas.skip import SkipConfig
+from schemas.stages import StageRecord
 from tests.flows.workers.scene import VIEWS, random_model, run_of, run_stages
 
 SOURCE = "procedural:dtu/3?views=9&width=32&height=24"
@@ -44,12 +49,20 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def job(out: Path, model: Path, *settings: str, split: str = "3") -> Job:
     texts = ["method=cat3d", f"sample.checkpoint={model}", "sample.steps=4", f"plan.views={VIEWS}", SMALL, *settings]
-    return make_jobs(SOURCE, out, [split], make_config({}, None, texts))[1][0]
+    return Request(SOURCE, out, (split,), make_config({}, None, texts)).jobs()[0]
+
+
+def trainer_config(job: Job) -> ZipNerfConfig:
+    return config_from_document(open_reconstructor(job).settings["trainer"])
 
 
 def field_of(job: Job) -> dict[str, np.ndarray]:
     field = run_of(job).field
     return {name: field.read(name) for name in field.attrs["parameters"]}
+
+
+def texts(record: StageRecord) -> list[str]:
+    return [decision.text for decision in record.decisions]
 
 
 def problems(job: Job) -> list:
@@ -74,7 +87,7 @@ def test_a_switch_makes_its_own_stage_stale_and_none_before_it(model: Path, tmp_
              "empty_space": "reconstruct", "proposals": "reconstruct", "plateau": "reconstruct",
              "rays": "reconstruct", "lpips": "reconstruct",
              "low_resolution": "reconstruct"}  # fmt: skip
-    capture = job(tmp_path, model).capture()
+    scene = job(tmp_path, model).scene
 
     def keys(**changed: bool) -> dict[str, str]:
         settings = [
@@ -82,7 +95,7 @@ def test_a_switch_makes_its_own_stage_stale_and_none_before_it(model: Path, tmp_
             for name, value in (dict.fromkeys(SkipConfig.model_fields, False) | changed).items()
         ]  # noqa: E501
         one = job(tmp_path, model, "sample.guidance=3", "reconstruct.overrides={}", *settings)
-        return {stage: step.key for stage, step in expected_steps(one, capture).items()}
+        return {stage: step.key for stage, step in expected_steps(one.sharing(scene)).items()}
 
     none = keys()
     for name in SkipConfig.model_fields:
@@ -117,11 +130,12 @@ def test_without_skips_every_stage_is_the_plain_core_bit_for_bit(model: Path, tm
     assert len(made) == VIEWS
     cameras = Cameras.cat([captured, *(camera for camera, _ in made)])
     images = [*read_images(store.captured, train), *(image for _, image in made)]
-    trainer = Trainer(trainer_config(one), Views(cameras, images, torch.arange(len(cameras)) < 3), one.config.seed)
+    views = Views.from_images(cameras, images, torch.arange(len(cameras)) < 3)
+    trainer = Trainer(trainer_config(one), views, one.config.seed)
     while not trainer.finished:
         trainer.step()
     for name, value in trainer.field.state_dict().items():
-        assert torch.equal(value, read_field(one, run).state_dict()[name]), name
+        assert torch.equal(value, read_reconstruction(store, run).tensors()[name]), name
 
 
 def _points(store: SceneStore) -> torch.Tensor | None:
@@ -139,7 +153,7 @@ def test_short_work_is_done_without_workers_and_is_the_same(model: Path, tmp_pat
         settings = one.config.skip.model_copy(update={"workers": name == "true"})
         one = one.model_copy(update={"config": one.config.model_copy(update={"skip": settings})})
         records = run_stages(one, *UP_TO_FIELD[:-1])
-        told = " ".join(records["sample"].decisions)
+        told = " ".join(texts(records["sample"]))
         assert ("Started no workers" in told) == (name == "true")
         assert records["sample"].work["evaluations"] == 2 * 4 * records["sample"].work["groups"]
         generated = run_of(one).generated
@@ -152,10 +166,10 @@ def test_a_covered_path_is_not_sampled_decoded_or_missed(model: Path, tmp_path: 
     monkeypatch.setattr("flows.stages.plan.COVERED_SHARE", 0.0)
     one = job(tmp_path, model)
     records = run_stages(one, *UP_TO_FIELD)
-    assert any("need not be generated" in d for d in records["plan"].decisions)
-    assert any("24 of 24 planned views were left out" in d for d in records["sample"].decisions)
-    assert any("Skipped decoding 24 of 24" in d for d in records["decode"].decisions)
-    assert any("captured views alone" in d for d in records["reconstruct"].decisions)
+    assert any("need not be generated" in d.text for d in records["plan"].decisions)
+    assert any("24 of 24 planned views were left out" in d.text for d in records["sample"].decisions)
+    assert any("Skipped decoding 24 of 24" in d.text for d in records["decode"].decisions)
+    assert any("captured views alone" in d.text for d in records["reconstruct"].decisions)
     assert records["sample"].work["evaluations"] == 0
     assert records["reconstruct"].work["views"] == 3
     assert not problems(one), "views left out on purpose are no damage"
@@ -174,12 +188,12 @@ def test_views_that_an_earlier_run_sampled_are_left_out_when_they_are_no_longer_
 
 def test_rounds_stop_when_the_held_out_view_no_longer_improves(model: Path, tmp_path: Path, monkeypatch) -> None:
     settings = "skip={rounds: true, covered_path: false, coverage: false}"
-    told = run_stages(job(tmp_path / "cheap", model, settings), *UP_TO_FIELD[:-1])["sample"].decisions
+    told = texts(run_stages(job(tmp_path / "cheap", model, settings), *UP_TO_FIELD[:-1])["sample"])
     assert any(d.startswith("Sampled in one round: all groups cost less than") for d in told)
     monkeypatch.setattr("flows.generation.rounds.BRIEF_FLOPS", 0.0)
     one = job(tmp_path, model, settings)
     records = run_stages(one, *UP_TO_FIELD)
-    told = [d for d in records["sample"].decisions if "ound" in d]
+    told = [d for d in texts(records["sample"]) if "ound" in d]
     assert told[0].startswith("Round 1: with 2 more groups the held-out captured view went from ")
     assert "chosen for this scene in" in told[-1]
     used = len(list(generated_views(run_of(one))))
@@ -187,14 +201,14 @@ def test_rounds_stop_when_the_held_out_view_no_longer_improves(model: Path, tmp_
     assert records["decode"].work["views"] == used < VIEWS, "a random model helps nothing, so its views are not used"
     assert not problems(one)
     again = job(tmp_path / "again", model, settings)
-    assert [d for d in run_stages(again, *UP_TO_FIELD)["sample"].decisions if "ound" in d] == told
+    assert [d for d in texts(run_stages(again, *UP_TO_FIELD)["sample"]) if "ound" in d] == told
     for name, values in field_of(one).items():
         assert np.array_equal(values, field_of(again)[name]), name
 
 
 def test_one_photo_is_sampled_in_one_round(model: Path, tmp_path: Path) -> None:
     one = job(tmp_path, model, "skip={rounds: true}", split="1")
-    told = run_stages(one, *UP_TO_FIELD[:-1])["sample"].decisions
+    told = texts(run_stages(one, *UP_TO_FIELD[:-1])["sample"])
     assert "Sampled in one round: of one captured view none can be held out." in told
 
 
@@ -216,7 +230,7 @@ def test_groups_near_captured_views_take_half_of_the_steps(model: Path, tmp_path
     assert distances[0] == pytest.approx(float((shift**2 + turn**2).sqrt().amin(1).mean()), abs=1e-9)
     record = run_stages(one, "sample")["sample"]
     assert record.work["steps"] == sum(steps)
-    assert any("took 2 steps" in d for d in record.decisions)
+    assert any("took 2 steps" in d.text for d in record.decisions)
 
 
 def test_another_path_does_not_render_the_held_out_views_again(model: Path, tmp_path: Path) -> None:
@@ -227,18 +241,18 @@ def test_another_path_does_not_render_the_held_out_views_again(model: Path, tmp_
         rendered.append(run_stages(one, *stages)["render"])
     test = len(run_of(one).renders("test").read("view"))
     assert [record.work["views"] for record in rendered] == [test + 2, 3]
-    assert any(f"Skipped {test} of {test + 3} renders" in d for d in rendered[1].decisions)
+    assert any(f"Skipped {test} of {test + 3} renders" in d.text for d in rendered[1].decisions)
 
 
 def test_generated_views_are_no_finer_than_the_photos_and_it_is_said(model: Path, tmp_path: Path) -> None:
     one = job(tmp_path, model, "skip=none")
     run_stages(one, *UP_TO_FIELD[:-1])
     store = SceneStore.open(one.store_path)
-    whole, share, told = training_views(one, store, store.run(one.run))
-    assert (share, told) == (0.0, [])
+    whole, told = training_views(one, store, store.run(one.run))
+    assert (left_out(whole), told) == (0.0, [])
     assert whole.size[3:].tolist() == [[64, 64]] * VIEWS
-    reduced, _, told = training_views(job(tmp_path, model, "skip={detail: true}"), store, store.run(one.run))
-    assert told[0].startswith(f"{VIEWS} of {VIEWS} generated views were reduced to ")
+    reduced, told = training_views(job(tmp_path, model, "skip={detail: true}"), store, store.run(one.run))
+    assert told[0].text.startswith(f"{VIEWS} of {VIEWS} generated views were reduced to ")
     assert len(reduced) == len(whole) == 3 + VIEWS
     assert torch.equal(reduced.size[:3], whole.size[:3])
     assert bool((reduced.size[3:] < 64).all())
@@ -248,17 +262,20 @@ def test_generated_views_are_no_finer_than_the_photos_and_it_is_said(model: Path
 def test_what_captured_views_show_is_not_learned_from_generated_ones(model: Path, tmp_path: Path) -> None:
     one = job(tmp_path, model, "skip={seen: true, covered_path: false, coverage: false}")
     records = run_stages(one, *UP_TO_FIELD)
-    told = next(d for d in records["reconstruct"].decisions if "captured views show their" in d)
+    told = next(d for d in texts(records["reconstruct"]) if "captured views show their" in d)
     store = SceneStore.open(one.store_path)
-    views, share, _ = training_views(one, store, store.run(one.run))
+    views, _ = training_views(one, store, store.run(one.run))
+    share = left_out(views)
     assert 0.05 < share < 0.95
     assert told.startswith(f"{share:.0%} of the pixels")
     counting = views.counting
     assert torch.equal(counting[:3], views.size[:3].prod(-1)), "captured pixels all count"
     assert int(counting[3:].sum()) == pytest.approx((1 - share) * int(views.size[3:].prod(-1).sum()), abs=1)
-    assert fitted(one, trainer_config(one), views, 0.9)[0].captured_share == 0.9
+    most = views.only(views.captured.repeat_interleave(views.size.prod(-1)) | (torch.rand(len(views.pixels)) < 0.1))
+    assert left_out(most) > 0.85
+    assert fitted(trainer_config(one), most, {})[0].captured_share == left_out(most)
     single = job(tmp_path / "single", model, "skip={seen: true}", split="1")
-    told_of_one = run_stages(single, *UP_TO_FIELD)["reconstruct"].decisions
+    told_of_one = texts(run_stages(single, *UP_TO_FIELD)["reconstruct"])
     assert not any("captured views show" in d for d in told_of_one), "one view alone has no depth"
     assert not problems(one)
 
@@ -268,11 +285,13 @@ def test_training_fits_what_there_is_to_train_on(model: Path, tmp_path: Path) ->
         count, side = captured + generated, 32
         poses = torch.eye(4, dtype=torch.float64).expand(count, 4, 4)
         cameras = Cameras(torch.eye(3, dtype=torch.float64).expand(count, 3, 3), poses, torch.full((count, 2), side))
-        return Views(cameras, [torch.zeros(side, side, 3, dtype=torch.uint8)] * count, torch.arange(count) < captured)
+        return Views.from_images(
+            cameras, [torch.zeros(side, side, 3, dtype=torch.uint8)] * count, torch.arange(count) < captured
+        )
 
-    def chosen(given: Views, *settings: str) -> ReconstructConfig:
+    def chosen(given: Views, *settings: str) -> ZipNerfConfig:
         one = job(tmp_path, model, "reconstruct.overrides={}", *settings)
-        return fitted(one, trainer_config(one), given)[0]
+        return fitted(trainer_config(one), given, one.config.skip.model_dump(), one.config.reconstruct.overrides)[0]
 
     few, both, dense = views(3, 0), views(3, 80), views(20, 0)
     assert chosen(few).batch_rays == 256, "a 24th of 3,072 pixels is less than the least"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.pipeline.jobs import Job
+from flows.jobs.job import Job
 from tests.flows.workers.scene import make_job, prepare, random_model, run_of, run_stages
 
 

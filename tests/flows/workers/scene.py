@@ -10,9 +10,9 @@ import torch
 
 from cat3d_core.diffusion import SIZES, MultiViewModel, save_model
 from flows.commands.run import make_config
-from flows.pipeline.jobs import Job, expected_steps, make_jobs, pending
-from flows.pipeline.locks import writing
-from flows.pipeline.scene import ensure_store, execute_stage, prepare_run
+from flows.jobs.job import Job, Request
+from flows.pipeline.keys import pending
+from flows.pipeline.runner import execute_stage, opened, prepare_run
 from schemas.scene_store import Run, SceneStore
 from schemas.stages import StageRecord
 
@@ -35,17 +35,14 @@ def make_job(out: Path, checkpoint: Path, split: str = "3", count: int = VIEWS, 
     """A cat3d run of `count` views in 24 steps: long enough to be interrupted."""
     document = [f"sample.checkpoint={checkpoint}", "sample.steps=24", f"plan.views={count}", "seed=5", "method=cat3d"]
     settings = [*document, *(f"execution.{name}={value}" for name, value in execution.items())]
-    return make_jobs(SOURCE, out, [split], make_config({}, None, settings))[1][0]
+    return Request(SOURCE, out, (split,), make_config({}, None, settings)).jobs()[0]
 
 
 def run_stages(job: Job, *stages: str) -> dict[str, StageRecord]:
     """Run those of the stages that are pending, in this process; their records."""
-    capture = job.capture()
-    with writing(job.store_path, job.scene_id):
-        ensure_store(job, capture)
-        prepare_run(job, capture)
-        steps = pending(job, expected_steps(job, capture))
-        return {step.stage: execute_stage(job, step) for step in steps if step.stage in stages}
+    with opened(job):
+        prepare_run(job)
+        return {step.stage: execute_stage(job, step) for step in pending(job) if step.stage in stages}
 
 
 def prepare(job: Job) -> None:

@@ -55,7 +55,7 @@ def test_a_lost_dask_workers_groups_are_taken_over(scene, expected, cluster, kin
     assert record.work["workers"] == 2
     assert np.array_equal(run_of(job).generated.read("latent"), expected["3"])
     if kind == signal.SIGSTOP:
-        assert any("finished nothing for" in d for d in record.decisions)
+        assert any("finished nothing for" in d.text for d in record.decisions)
 
 
 def test_an_answer_that_never_comes_is_a_lost_worker(cluster, monkeypatch: pytest.MonkeyPatch) -> None:

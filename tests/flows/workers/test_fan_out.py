@@ -8,9 +8,10 @@ import torch
 
 from flows.errors import WorkerError
 from flows.generation.groups import StoredPlan
-from flows.generation.model import sampler_config
+from flows.generation.model import sampler_config, shared_model
 from flows.generation.shrinking import sample_at_most
-from flows.pipeline.jobs import Job, Step, expected_steps
+from flows.jobs.job import Job
+from flows.pipeline.keys import Step, expected_steps
 from flows.stages import sample as sample_stage
 from flows.stages.sample import alike, network_inputs, sample_work
 from flows.workers import fan_out as fan_out_module
@@ -23,7 +24,7 @@ from tests.flows.workers.scene import chunk_times, run_of, run_stages
 
 
 def steps_of(job: Job) -> dict[str, Step]:
-    return expected_steps(job, job.capture())
+    return expected_steps(job)
 
 
 @pytest.mark.parametrize("split", ["3", "1"])
@@ -141,7 +142,7 @@ def test_anchors_are_sampled_before_the_views_that_need_them(scene) -> None:
 
 def test_conditions_are_training_views_of_the_store(scene) -> None:
     job = scene("3")
-    train = set(job.split(job.capture())["train"])
+    train = set(job.split["train"])
     store = SceneStore.open(job.store_path)
     plan = StoredPlan(store, store.run(job.run), 0)
     assert {c for group in plan.groups for c in group.conditions} == train
@@ -176,7 +177,6 @@ def test_several_scenes_share_the_workers(scene, expected) -> None:
 def test_out_of_memory_halves_the_batch_and_gives_the_same_result(scene, monkeypatch) -> None:
     """The allocator's error is raised by hand where more than one group is evaluated; the rest is real."""
     from flows.generation import shrinking
-    from flows.generation.model import shared_model
 
     job = scene()
     store = SceneStore.open(job.store_path)
@@ -238,8 +238,11 @@ def test_batches_last_about_as_long_as_asked_and_shrink_towards_the_end(scene) -
 
 
 def test_a_workers_error_keeps_its_type_and_names_its_cause(scene) -> None:
-    batch = Batch(number=7, job=scene(), stage="sample", key="0" * 64, items=(0,))
-    answer = run_batch(batch)  # nobody has made room for the latents
+    batch = Batch(
+        number=7, job=scene(), stage="sample", key="0" * 64, items=(0,), load=shared_model, share=sample_stage.work
+    )  # nobody has made room for the latents
+    assert Batch.model_validate_json(batch.model_dump_json()) == batch
+    answer = run_batch(batch)
     assert answer.number == 7
     assert Answer.model_validate_json(answer.model_dump_json()) == answer
     with pytest.raises(StoreError, match="generated.latent.*does not exist"):

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from flows.errors import WorkerError
-from flows.pipeline.jobs import Job
+from flows.jobs.job import Job
 from schemas.documents import leftovers
 from schemas.scene_store import SceneStore
 from schemas.verify import verify
@@ -61,7 +61,7 @@ def test_a_killed_workers_groups_are_taken_over(scene, expected) -> None:
     with Trouble(job, signal.SIGKILL) as trouble:
         record = run_stages(job, "sample")["sample"]
     assert len(trouble.struck) == 1
-    assert any("was killed by SIGKILL" in d and "handed to another" in d for d in record.decisions)
+    assert any("was killed by SIGKILL" in d and "handed to another" in d.text for d in record.decisions)
     assert np.array_equal(run_of(job).generated.read("latent"), expected["3"])
     assert leftovers(job.store_path) == []
     assert workers_of(os.getpid()) == []
@@ -73,7 +73,7 @@ def test_a_hanging_worker_is_given_up_and_its_groups_are_taken_over(scene, expec
     with Trouble(job, signal.SIGSTOP) as trouble:
         record = run_stages(job, "sample")["sample"]
     assert len(trouble.struck) == 1
-    assert any("finished nothing for 25 s" in d for d in record.decisions)
+    assert any("finished nothing for 25 s" in d.text for d in record.decisions)
     assert np.array_equal(run_of(job).generated.read("latent"), expected["3"])
     assert workers_of(os.getpid()) == []
 

@@ -5,8 +5,7 @@ import torch
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.rays import image_rays
-from cat3d_core.zipnerf import Render, point_cloud
-from cat3d_core.zipnerf.render import normals_from_depth
+from cat3d_core.reconstruction import Render, normals_from_depth, point_cloud
 
 
 def _plane_render(cameras: Cameras, height: int, width: int, opacity: float = 1.0) -> Render:

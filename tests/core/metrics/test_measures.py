@@ -7,7 +7,15 @@ import pytest
 import torch
 
 from cat3d_core.cameras import Cameras
-from flows.stages.evaluate import geometry_row
+from cat3d_core.metrics.measures import METRICS, Comparison
+
+
+def geometry_row(depth: np.ndarray, opacity: np.ndarray, truth: np.ndarray, camera: Cameras) -> dict[str, float]:
+    """Depth and surface errors, without those that don't apply."""
+    black = torch.zeros(3, *depth.shape)
+    view = Comparison("google", black, black, None, *map(torch.from_numpy, (depth, opacity, truth)), camera)
+    found = {m.name: m.measure(view) for m in METRICS if m.name in ("depth_abs_rel", "surface_chamfer")}
+    return {name: number for name, number in found.items() if number is not None}
 
 
 def camera(size: int = 16) -> Cameras:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.rays import image_rays
-from cat3d_core.zipnerf.render import Render
+from cat3d_core.reconstruction.render import Render
 
 
 class PointCloud(NamedTuple):

@@ -1,0 +1,153 @@
+"""One run of one scene, the request that asks for such runs, and what a stage of it did."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, PrivateAttr
+
+from cat3d_core.diffusion.solvers import check_solver
+from flows.errors import InputError
+from flows.jobs.scene import Scene
+from flows.readers.base import Capture
+from schemas.config import RunConfig
+from schemas.decisions import Decision
+from schemas.errors import ConfigError
+
+
+class Job(BaseModel):
+    """One run of one scene: where it comes from, which views train, how, and where results go. JSON in, JSON out."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    source: str
+    reader: str = "auto"
+    image_folder: str | None = None
+    out: Path
+    scene_id: str
+    dataset: str
+    config: RunConfig
+    store: Path | None = None
+    results: Path | None = None
+
+    _scene: Scene = PrivateAttr()
+
+    def model_post_init(self, _context: Any) -> None:
+        self._scene = Scene(self.source, self.reader, self.image_folder)
+
+    @property
+    def store_path(self) -> Path:
+        """Where the scene's store is; `store` overrides it while a scene is reprocessed beside its old results."""
+        return self.store or self.out / f"{self.scene_id}.zarr"
+
+    @property
+    def label(self) -> str:
+        """The method's name, or that of the ablation."""
+        return self.config.label or self.config.method
+
+    @property
+    def generates(self) -> bool:
+        """Whether views are generated."""
+        return self.config.method != "zipnerf"
+
+    @property
+    def run(self) -> str:
+        """Name of the run inside the store, e.g. "v3-zipnerf"; seeds other than 0 are named too."""
+        seed = f"-s{self.config.seed}" if self.config.seed else ""
+        return f"v{self.config.split}-{self.label}{seed}"
+
+    @property
+    def results_path(self) -> Path:
+        """Folder of metrics and pictures; `results` overrides it as `store` does the store."""
+        return self.results or self.out
+
+    @property
+    def pictures(self) -> Path:
+        """Folder of the run's pictures, videos and exports."""
+        return self.results_path / self.scene_id / self.run
+
+    @property
+    def scene(self) -> Scene:
+        """The scene where it lies; copies of a job share what was read of it."""
+        return self._scene
+
+    def sharing(self, scene: Scene) -> Job:
+        """The job, which takes what was read of its scene already."""
+        copy = self.model_copy()
+        copy._scene = scene
+        return copy
+
+    def capture(self) -> Capture:
+        """The scene as its reader found it."""
+        return self.scene.capture
+
+    @property
+    def split(self) -> dict[str, list[int]]:
+        """Training and test indices of this run. Raises SplitError when the scene has no such split."""
+        splits = self.capture().splits
+        if self.config.split not in splits:
+            known = ", ".join(splits) or "none"
+            raise SplitError(
+                f"Scene {self.scene_id} has no split for {self.config.split} views (its splits: {known}); "
+                "choose one of those with --views."
+            )
+        return splits[self.config.split]
+
+    def view_names(self, role: str) -> list[str]:
+        """Names of the views that train ("train") or are held out ("test")."""
+        return [self.capture().names[view] for view in self.split[role]]
+
+
+class SplitError(InputError):
+    """The scene has no split for the number of training views that is asked for."""
+
+
+class Outcome(NamedTuple):
+    """What a stage did: `work` counts (views, rays, ...); `decisions` say what was chosen, skipped or is wrong."""
+
+    work: dict[str, float] = {}
+    decisions: list[Decision] = []
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a command asks for: runs of one scene, one for each of `views` (splits), with one configuration."""
+
+    source: str
+    out: Path
+    views: tuple[str, ...] = ("all",)
+    config: RunConfig = RunConfig()
+    reader: str = "auto"
+    image_folder: str | None = None
+
+    def jobs(self, scene: Scene | None = None) -> list[Job]:
+        """A job for each split, with `method: auto` decided. scene: where that was read already.
+
+        Raises InputError for bad input, SplitError for an unknown split, ConfigError for an unknown solver.
+        """
+        if self.config.sample.solver is not None:
+            try:  # solvers are registered in the core, which the schemas do not see
+                check_solver(self.config.sample.solver)
+            except ValueError as error:
+                raise ConfigError(f"sample.solver: {error}") from None
+        scene = scene or Scene(str(self.source), self.reader, self.image_folder)
+        jobs = []
+        for split in self.views:
+            config = self.config.model_copy(update={"split": str(split)})
+            job = Job(
+                source=scene.source,
+                reader=scene.reader,
+                image_folder=scene.image_folder,
+                out=self.out,
+                scene_id=scene.capture.scene_id,
+                dataset=scene.capture.dataset,
+                config=config,
+            ).sharing(scene)
+            few = len(job.split["train"]) == 1
+            if config.method == "auto":
+                config = config.model_copy(update={"method": "cat3d" if few else "zipnerf"})
+                job = job.model_copy(update={"config": config})
+            jobs.append(job)
+        return jobs

@@ -1,0 +1,34 @@
+"""A finished sweep made by an older version is complete for this one: nothing is done again."""
+
+from __future__ import annotations
+
+import os
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from flows.pipeline.sweep import open_jobs, run_sweep, sweep_jobs
+from flows.reporting.metric_table import metric_table
+from schemas.config import SweepConfig, load_config
+from schemas.tables import TIMINGS, read_rows
+
+FIXTURE = Path(__file__).parents[2] / "fixtures" / "sweep_of_0888913.tar.gz"
+
+
+def test_a_sweep_of_commit_0888913_is_not_redone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with tarfile.open(FIXTURE) as archive:
+        archive.extractall(tmp_path, filter="data")
+    monkeypatch.chdir(tmp_path)
+    config = load_config(Path("sweep.yaml"), SweepConfig)
+    out = Path("out").resolve()
+    scenes, problems = sweep_jobs(config, out)
+    assert not problems
+    assert [job.run for jobs in scenes for job in jobs] == ["v3-zipnerf", "v3-cat3d"]
+    assert [open_jobs(jobs) for jobs in scenes] == [[]]
+    executed = read_rows(out / "timings", TIMINGS).num_rows
+    metrics = read_rows(out / "metrics", metric_table()).to_pylist()
+    assert run_sweep(config, out) == []
+    assert read_rows(out / "timings", TIMINGS).num_rows == executed
+    assert read_rows(out / "metrics", metric_table()).to_pylist() == metrics
+    assert os.path.getsize(out / "report.html") > 0
