@@ -103,7 +103,7 @@ def export(
     store: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder) with a finished run.")],
     run_name: Annotated[str | None, typer.Option("--run", help="The run, where the store has several.")] = None,
     what: Annotated[
-        str, typer.Option(help="mesh, points, dataset, renders; several by commas. All but renders if not given.")
+        str, typer.Option(help="mesh, points, splats, dataset, renders; with commas. All but renders if not given.")
     ] = "",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the exports.")] = Path("exports"),
     frame: Annotated[
@@ -114,17 +114,19 @@ def export(
         float, typer.Option(help="What counts as surface, in mean distances from the cameras to what they look at.")
     ] = 3.0,
     opacity: Annotated[float, typer.Option(help="Least opacity of a pixel that counts as surface.")] = 0.5,
-    views: Annotated[int, typer.Option(help="Cameras to render for mesh and points, at most.")] = 120,
+    views: Annotated[int, typer.Option(help="Cameras to render for mesh, points and splats, at most.")] = 120,
     scale: Annotated[float, typer.Option(help="Their size relative to the photos.")] = 1.0,
+    splats: Annotated[int, typer.Option(help="Splats, at most.")] = 200_000,
+    refine: Annotated[int, typer.Option(help="Steps in which splats learn to look like the renders.")] = 300,
     path: Annotated[
         Path | None,
         typer.Option(help='Renders along it: JSON list of {"world_from_camera": 4x4, "fov": degrees}, in --frame.'),
     ] = None,
 ) -> None:
-    """A finished run as a mesh (PLY, GLB), points, a nerfstudio and COLMAP data set, or renders along any path."""
+    """A finished run as a mesh (PLY, GLB), points, splats (PLY, SPLAT, SPZ), a data set, or renders along any path."""
     from flows.commands.export import SurfaceSettings, export_command
 
-    settings = SurfaceSettings(resolution, radius, opacity, views, scale)
+    settings = SurfaceSettings(resolution, radius, opacity, views, scale, splats, refine)
     export_command(store, run_name, what, out, frame, settings, path)
 
 

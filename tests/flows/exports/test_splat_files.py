@@ -13,7 +13,16 @@ import torch
 from cat3d_core.splats.gaussians import Gaussians, rotation_matrices
 from cat3d_core.splats.rasterize import rasterize
 from flows.errors import InputError
-from flows.exports.splats import READERS, WRITERS, read_ply, read_splat, read_spz, write_ply, write_splat, write_spz
+from flows.exports.splat_files import (
+    READERS,
+    WRITERS,
+    read_ply,
+    read_splat,
+    read_spz,
+    write_ply,
+    write_splat,
+    write_spz,
+)
 from tests.core.splats.scenes import camera, gaussians
 
 DEGREES = [0, 1, 2]
