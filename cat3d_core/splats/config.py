@@ -18,13 +18,13 @@ class SplatConfig:
     window: int = 192
     """Pixels: of views that are larger, a step sees a square of this side, at random."""
     views_per_step: int = 1
-    lr_means: float = 0.01
+    lr_means: float = 0.015
     lr_means_final: float = 0.0005
     """Means are moved in contracted coordinates (mip-NeRF 360 eq. 10): what is far moves as fast in an image."""
-    lr_log_scales: float = 0.02
+    lr_log_scales: float = 0.04
     lr_quaternions: float = 0.01
     lr_logits: float = 0.05
-    lr_harmonics: float = 0.02
+    lr_harmonics: float = 0.04
     lr_final: float = 0.3
     """Share of the other learning rates at the end; all fall logarithmically."""
     adam_beta1: float = 0.9
@@ -112,7 +112,8 @@ PRESETS: dict[str, SplatConfig] = {
 }  # fmt: skip
 REFINE = replace(
     _FAST, iterations=300, lr_means=0.001, lr_means_final=0.0001, lr_quaternions=0.005, noise=0.0, density_every=0,
-    opacity_weight=0.0, scale_weight=0.0, lpips_weight=0.0, background=(0.5, 0.5),
+    lr_log_scales=0.02, lr_harmonics=0.02, opacity_weight=0.0, scale_weight=0.0, lpips_weight=0.0,
+    background=(0.5, 0.5),
 )  # fmt: skip
 """Splats that a field gave, on the field's own renders: their number stays, and they move a little. (A mip360 scene of
 64 pixels: 27.5 dB without moving them, 28.3 dB with, the field itself 28.9 dB.)"""
