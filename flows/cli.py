@@ -44,11 +44,12 @@ def run(
 ) -> None:
     """Photos in, 3D scene out: renders, metrics and a report. Stages that are done already are not done again."""
     from flows.commands.run import run_command
+    from flows.jobs.request import make_request
 
     given = {"downscale": downscale, "method": method, "preset": preset, "seed": seed}
     if model is not None:
         given["model"] = str(model.resolve())
-    run_command(source, out, views.split(","), given, reader, images, config, set_ or [])
+    run_command(make_request(source, out, views, given, reader, images, config, set_ or []))
 
 
 @app.command()
@@ -81,9 +82,10 @@ def plan(
 ) -> None:
     """Which views would be generated, how they are grouped and on what they are conditioned: a table and a picture."""
     from flows.commands.plan import plan_command
+    from flows.jobs.request import make_request
 
-    given = {"downscale": downscale, "seed": seed, "trajectory": trajectory, "count": count}
-    plan_command(source, out, views.split(","), given, reader, images, config, set_ or [], rows)
+    given = {"method": "cat3d", "downscale": downscale, "seed": seed, "trajectory": trajectory, "count": count}
+    plan_command(make_request(source, out, views, given, reader, images, config, set_ or []), rows)
 
 
 @app.command()

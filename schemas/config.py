@@ -18,9 +18,11 @@ from pydantic import (
     PositiveFloat,
     PositiveInt,
     ValidationError,
+    model_validator,
 )
 
 from schemas.errors import ConfigError
+from schemas.settings import spelled_out
 from schemas.skip import SkipConfig
 from schemas.strict import StrictModel as _Model
 
@@ -165,10 +167,11 @@ class EvaluateConfig(_Model):
 class RunConfig(_Model):
     """One run of one scene."""
 
-    method: Literal["auto", "zipnerf", "cat3d"] = "auto"
-    """`zipnerf` fits the captured views alone; `cat3d` generates views first; `auto`: cat3d for a single photo."""
+    generate: Literal["auto", "always", "never"] = "auto"
+    """Whether views are generated before the reconstruction; `auto`: for a single photo. `method: zipnerf` is short for
+    never, `method: cat3d` for always."""
     label: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,40}$")] | None = None
-    """Name of the variant in run names and tables; None: the method's name."""
+    """Name of the variant in run names and tables; None: cat3d where views are generated, else the reconstructor's."""
     split: Annotated[str, Field(coerce_numbers_to_str=True)] = "all"
     """Captured views to train on: a count (1, 3, 6, 9), `all`, or the name of a split of the data set."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
@@ -182,6 +185,11 @@ class RunConfig(_Model):
     evaluate: EvaluateConfig = Field(default_factory=EvaluateConfig)
     skip: SkipConfig = Field(default_factory=SkipConfig)
     execution: ExecutionConfig = Field(default_factory=ExecutionConfig)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_name(cls, value: Any) -> Any:
+        return spelled_out(value) if isinstance(value, dict) else value
 
 
 class SceneSource(_Model):
@@ -254,6 +262,8 @@ def _sentence(source: str, error: dict[str, Any], model: type[BaseModel]) -> str
         return f"{source}: {field} is not a setting; {_known(error['loc'], model)}."
     if error["type"] == "missing":
         return f"{source}: {field} is missing."
+    if isinstance(cause := error.get("ctx", {}).get("error"), ConfigError):
+        return f"{source}: {cause}"
     message = error["msg"][0].lower() + error["msg"][1:]
     return f"{source}: {field} is {error['input']!r}, but {message}."
 

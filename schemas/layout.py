@@ -18,21 +18,6 @@ SCHEMA_VERSION = 2
 #: Stores from this version on are read as they are; opening one for writing brings it up to date.
 OLDEST_READABLE = 1
 
-#: Stages in the order they run, each with the stages whose results it reads.
-STAGES: dict[str, tuple[str, ...]] = {
-    "ingest": (),
-    "poses": ("ingest",),
-    "plan": ("poses",),
-    "encode": ("poses",),
-    "sample": ("plan", "encode"),
-    "decode": ("sample",),
-    "reconstruct": ("poses", "decode"),
-    "render": ("reconstruct",),
-    "evaluate": ("render",),
-}
-#: Stages done once for a scene; the others are done once for each run.
-SCENE_STAGES = ("ingest", "poses", "encode")
-
 
 @dataclass(frozen=True)
 class Dim:
@@ -173,6 +158,9 @@ LAYOUT: tuple[ArraySpec, ...] = (
 )
 # fmt: on
 
+#: Stages done once for a scene: they write outside of runs. The others are done once for each run.
+SCENE_STAGES = {spec.stage for spec in LAYOUT if spec.stage and not spec.path.startswith("runs/")}
+
 #: Meaning of `runs/<run>/role`.
 ROLES = {"unused": 0, "train": 1, "test": 2}
 
@@ -216,17 +204,6 @@ def done_path(path: str) -> str | None:
     return "/".join((*path.split("/")[:-1], spec.done.split("/")[-1]))
 
 
-def downstream(stage: str) -> tuple[str, ...]:
-    """`stage` and every stage that reads its results, directly or not, in the order they run."""
-    check_stage(stage)
-    affected: set[str] = {stage}
-    for name, inputs in STAGES.items():
-        if affected.intersection(inputs):
-            affected.add(name)
-    return tuple(name for name in STAGES if name in affected)
-
-
-def check_stage(stage: str) -> None:
-    """Raises ValueError for a name that is no stage."""
-    if stage not in STAGES:
-        raise ValueError(f"{stage!r} is not a stage; the stages are {', '.join(STAGES)}.")
+def markers(stage: str) -> list[str]:
+    """Paths, as in the layout, of the arrays of content keys that say which views of a stage are done."""
+    return [spec.path for spec in LAYOUT if spec.stage == stage and spec.kind == "key"]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from schemas.documents import nodes, read_group, read_metadata, write_group, write_metadata
 from schemas.errors import StoreError
-from schemas.layout import SCENE_STAGES, SCHEMA_VERSION, STAGES, describe
+from schemas.layout import SCENE_STAGES, SCHEMA_VERSION, describe
 
 
 def _from_0(store: Path) -> None:
@@ -24,9 +24,8 @@ def _from_0(store: Path) -> None:
             (store / name).rename(run / name)
         elif not (run / name / "zarr.json").exists():
             write_group(run / name, {})
-    for stage in STAGES:
-        if (store / "stages" / stage).exists() and stage not in SCENE_STAGES:
-            (store / "stages" / stage).rename(run / "stages" / stage)
+    for stage in [path for path in (store / "stages").iterdir() if path.is_dir() and path.name not in SCENE_STAGES]:
+        stage.rename(run / "stages" / stage.name)
     attributes = read_group(store)
     attributes.setdefault("dataset", "unknown")
     attributes.setdefault("provenance", {})

@@ -7,14 +7,14 @@ Written by many processes at once under one rule: a view is a chunk and has one 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from schemas import migrations
 from schemas.documents import checked_name, leftovers, read_metadata
 from schemas.errors import MissingError, StoreError
-from schemas.layout import FORMAT, OLDEST_READABLE, SCENE_STAGES, SCHEMA_VERSION, STAGES, check_stage, downstream
+from schemas.layout import FORMAT, OLDEST_READABLE, SCENE_STAGES, SCHEMA_VERSION
 from schemas.section import Section, make_tree
 from schemas.stages import StageRecord, read_record, remove_record, write_record
 
@@ -140,15 +140,14 @@ class SceneStore(Section):
             raise ValueError(f"The record is of the stage {record.stage!r}, not of {stage!r}.")
         write_record(self._stages(stage, run), record)
 
-    def invalidate(self, stage: str, run: str | None = None) -> list[str]:
-        """Take back the records of `stage` and of every stage after it; data stays. Returns what was taken back.
-
-        A stage that is done once a scene takes back the later stages of all runs.
+    def invalidate(self, stages: Sequence[str], run: str | None = None) -> list[str]:
+        """Take back the records of a stage and of those after it, in the order they run; data stays. Returns what was
+        taken back. Where the first is done once a scene, those of all runs are taken back.
         """
         self._check_writable()
         removed = []
-        for name in reversed(downstream(stage)):  # the last stage first: killed midway, what is left is consistent
-            runs = [None] if name in SCENE_STAGES else (self.runs() if stage in SCENE_STAGES else [run])
+        for name in reversed(stages):  # the last stage first: killed midway, what is left is consistent
+            runs = [None] if name in SCENE_STAGES else (self.runs() if stages[0] in SCENE_STAGES else [run])
             for owner in runs:
                 if remove_record(self._stages(name, owner), name):
                     removed.append(name if owner is None else f"{owner}/{name}")
@@ -169,8 +168,7 @@ class SceneStore(Section):
         return [str(path.relative_to(self.folder)) for path in found]
 
     def _stages(self, stage: str, run: str | None) -> Path:
-        check_stage(stage)
-        if stage in SCENE_STAGES:
+        if checked_name(stage) in SCENE_STAGES:
             return self.folder / "stages"
         if run is None:
             raise ValueError(f"The stage {stage!r} is done per run: say which run.")
@@ -196,4 +194,4 @@ def _root_attributes(path: Path) -> dict[str, Any]:
     return attributes
 
 
-__all__ = ["STAGES", "MissingError", "Run", "SceneStore", "Section", "StageRecord", "StoreError"]
+__all__ = ["MissingError", "Run", "SceneStore", "Section", "StageRecord", "StoreError"]

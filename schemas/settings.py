@@ -9,14 +9,47 @@ import yaml
 
 from schemas.errors import ConfigError
 
+#: What the short names `method: NAME` and `--method NAME` stand for.
+METHODS: dict[str, dict[str, Any]] = {
+    "auto": {"generate": "auto"},
+    "zipnerf": {"generate": "never", "reconstruct": {"method": "zipnerf"}},
+    "cat3d": {"generate": "always", "reconstruct": {"method": "zipnerf"}},
+}
+
+
+def spelled_out(document: dict[str, Any]) -> dict[str, Any]:
+    """Settings with the short name `method`, as files and stores of earlier versions have it, replaced by what it
+    stands for. Raises ConfigError for an unknown name, and for one that contradicts `generate` or `reconstruct`."""
+    if "method" not in document:
+        return document
+    rest = {name: value for name, value in document.items() if name != "method"}
+    name = document["method"]
+    if name not in METHODS:
+        raise ConfigError(f"method is {name!r}; it may be {', '.join(METHODS)}.")
+    for where in ("generate", "reconstruct.method"):
+        own, short = (_at(d, where.split(".")) for d in (rest, METHODS[name]))
+        if own is not None and short not in (None, own):
+            raise ConfigError(f"method {name} stands for {where} {short}, but {where} is {own}: give one of the two.")
+    return _merged(METHODS[name], rest)
+
+
+def _at(document: Any, path: Sequence[str]) -> Any:
+    for part in path:
+        document = document.get(part) if isinstance(document, dict) else None
+    return document
+
 
 def merged(*documents: dict[str, Any]) -> dict[str, Any]:
-    """Nested settings, later documents over earlier ones."""
+    """Nested settings of a run, later documents over earlier ones; `method` is spelled out in each."""
+    return _merged(*map(spelled_out, documents))
+
+
+def _merged(*documents: dict[str, Any]) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for document in documents:
         for name, value in document.items():
             both = isinstance(value, dict) and isinstance(out.get(name), dict)
-            out[name] = merged(out[name], value) if both else value
+            out[name] = _merged(out[name], value) if both else value
     return out
 
 

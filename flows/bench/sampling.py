@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from flows.commands.run import make_config
-from flows.jobs.job import Job, Request
+from flows.jobs.job import Job
+from flows.jobs.request import Request, make_config
 from flows.pipeline.runner import opened, run_missing
 from flows.pipeline.server import prefect_server
 from flows.stages.sample import sample_work

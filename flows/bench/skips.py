@@ -17,8 +17,8 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
-from flows.commands.run import make_config
-from flows.jobs.job import Job, Request
+from flows.jobs.job import Job
+from flows.jobs.request import Request, make_config
 from flows.pipeline.keys import Step, stages_of
 from flows.pipeline.runner import execute_stage, opened, run_missing
 from flows.readers import read_capture

@@ -148,7 +148,7 @@ def redo(found: list[Stale], from_stage: str | None = None) -> None:
         if from_stage and fresh:  # a clone that is there already had its records taken back before
             store = SceneStore.open(clone, "r+")
             for job in jobs:
-                store.invalidate(from_stage, job.run)
+                store.invalidate(downstream(from_stage), job.run)
         if jobs:
             run_jobs(jobs)
         publish(results, stale.store.parent)

@@ -3,44 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from flows.jobs.job import Job, Request
+from flows.jobs.job import Job
+from flows.jobs.request import Request, make_request
 from flows.pipeline.keys import pending
 from flows.progress import console
-from schemas.config import RunConfig, load_config, parse_config
-from schemas.settings import merged, set_at, settings_document, value_at
 
-#: Where each command-line option lives in the configuration.
-OPTION_FIELDS = {
-    "downscale": ("ingest", "downscale"),
-    "method": ("method",),
-    "preset": ("reconstruct", "preset"),
-    "seed": ("seed",),
-    "model": ("sample", "checkpoint"),
-    "trajectory": ("plan", "trajectory"),
-    "count": ("plan", "views"),
-}
 DEMO_SOURCE = "procedural:co3d/4?views=16&width=96&height=96"
 
 
-def run_command(
-    source: str,
-    out: Path,
-    views: Sequence[str],
-    given: dict[str, Any],
-    reader: str = "auto",
-    image_folder: str | None = None,
-    config_file: Path | None = None,
-    settings: Sequence[str] = (),
-) -> list[Job]:
+def run_command(request: Request) -> list[Job]:
     """Do everything that is not done yet for one scene and its splits. Raises InputError, ConfigError and others."""
-    started = time.monotonic()
-    config = make_config(given, config_file, settings)
-    with console.status(f"Reading {source}"):
-        request = Request(source, out.resolve(), tuple(v.strip() for v in views), config, reader, image_folder)
+    started, out = time.monotonic(), request.out
+    with console.status(f"Reading {request.source}"):
         jobs = request.jobs()
         capture = jobs[0].capture()
         todo = {job.run: pending(job) for job in jobs}
@@ -54,15 +31,15 @@ def run_command(
     if any(todo.values()):
         from flows.pipeline.server import prefect_server
 
-        with prefect_server(out.resolve() / ".prefect"):
+        with prefect_server(out / ".prefect"):
             from flows.pipeline.scene import scene_flow
 
             scene_flow(capture.scene_id, jobs)
     from flows.reporting.report import write_report
     from flows.reporting.summary import print_metrics
 
-    report = write_report(out.resolve(), only_if_changed=not any(todo.values()))
-    print_metrics(out.resolve(), capture.scene_id)
+    report = write_report(out, only_if_changed=not any(todo.values()))
+    print_metrics(out, capture.scene_id)
     console.print(f"Report: {report}  ({time.monotonic() - started:.0f} s)")
     return jobs
 
@@ -80,16 +57,5 @@ def demo_command(out: Path, smallest: bool) -> None:
 
     # One server for both: Prefect's client keeps its connection to the first one for as long as the process lives.
     with prefect_server(out.resolve() / ".prefect"):
-        for method, views in (("zipnerf", ["3"] if smallest else ["3", "all"]), ("cat3d", ["3"])):
-            run_command(DEMO_SOURCE, out, views, given | {"method": method}, settings=settings)
-
-
-def make_config(given: dict[str, Any], config_file: Path | None, settings: Sequence[str]) -> RunConfig:
-    """The run's configuration: file, then --set, then options that differ from their defaults."""
-    document = load_config(config_file).model_dump(mode="json") if config_file else {}
-    defaults = RunConfig().model_dump(mode="json")
-    for name, value in given.items():
-        path = OPTION_FIELDS[name]
-        if config_file is None or value != value_at(defaults, path):
-            set_at(document, path, value)
-    return parse_config(merged(document, settings_document(settings)), "the settings")
+        for method, views in (("zipnerf", "3" if smallest else "3,all"), ("cat3d", "3")):
+            run_command(make_request(DEMO_SOURCE, out, views, given | {"method": method}, settings=settings))

@@ -1,20 +1,18 @@
-"""One run of one scene, the request that asks for such runs, and what a stage of it did."""
+"""One run of one scene, and what a stage of it did."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, PrivateAttr
 
-from cat3d_core.diffusion.solvers import check_solver
 from flows.errors import InputError
 from flows.jobs.scene import Scene
+from flows.jobs.usage import Usage
 from flows.readers.base import Capture
 from schemas.config import RunConfig
 from schemas.decisions import Decision
-from schemas.errors import ConfigError
 
 
 class Job(BaseModel):
@@ -45,12 +43,14 @@ class Job(BaseModel):
     @property
     def label(self) -> str:
         """The method's name, or that of the ablation."""
-        return self.config.label or self.config.method
+        method = self.config.reconstruct.method
+        generating = "cat3d" if method == "zipnerf" else f"cat3d-{method}"
+        return self.config.label or (generating if self.generates else method)
 
     @property
     def generates(self) -> bool:
         """Whether views are generated."""
-        return self.config.method != "zipnerf"
+        return self.config.generate != "never"
 
     @property
     def run(self) -> str:
@@ -105,49 +105,9 @@ class SplitError(InputError):
 
 
 class Outcome(NamedTuple):
-    """What a stage did: `work` counts (views, rays, ...); `decisions` say what was chosen, skipped or is wrong."""
+    """What a stage did: `work` counts (views, rays, ...); `decisions` say what was chosen, skipped or is wrong; `usage`
+    is that of other processes that had a share of the work."""
 
     work: dict[str, float] = {}
     decisions: list[Decision] = []
-
-
-@dataclass(frozen=True)
-class Request:
-    """What a command asks for: runs of one scene, one for each of `views` (splits), with one configuration."""
-
-    source: str
-    out: Path
-    views: tuple[str, ...] = ("all",)
-    config: RunConfig = RunConfig()
-    reader: str = "auto"
-    image_folder: str | None = None
-
-    def jobs(self, scene: Scene | None = None) -> list[Job]:
-        """A job for each split, with `method: auto` decided. scene: where that was read already.
-
-        Raises InputError for bad input, SplitError for an unknown split, ConfigError for an unknown solver.
-        """
-        if self.config.sample.solver is not None:
-            try:  # solvers are registered in the core, which the schemas do not see
-                check_solver(self.config.sample.solver)
-            except ValueError as error:
-                raise ConfigError(f"sample.solver: {error}") from None
-        scene = scene or Scene(str(self.source), self.reader, self.image_folder)
-        jobs = []
-        for split in self.views:
-            config = self.config.model_copy(update={"split": str(split)})
-            job = Job(
-                source=scene.source,
-                reader=scene.reader,
-                image_folder=scene.image_folder,
-                out=self.out,
-                scene_id=scene.capture.scene_id,
-                dataset=scene.capture.dataset,
-                config=config,
-            ).sharing(scene)
-            few = len(job.split["train"]) == 1
-            if config.method == "auto":
-                config = config.model_copy(update={"method": "cat3d" if few else "zipnerf"})
-                job = job.model_copy(update={"config": config})
-            jobs.append(job)
-        return jobs
+    usage: Usage = Usage()

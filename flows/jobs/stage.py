@@ -6,12 +6,13 @@ list `STAGES` of `flows/stages/__init__.py`. Nothing else knows the stages.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from flows.jobs.job import Job, Outcome
 from schemas.config import RunConfig
+from schemas.layout import SCENE_STAGES
 from schemas.scene_store import SceneStore
 
 
@@ -37,8 +38,7 @@ class Stage:
     """A step from stored results to further ones.
 
     name: also that of its record, and of its arrays in the layout. reads: the stages whose results it reads; their keys
-    are part of its own. per: done once for a `scene`, or for each `run`. version: raised when the same inputs give
-    another result.
+    are part of its own. version: raised when the same inputs give another result.
     execute(job, store, key): reads what earlier stages stored, calls the core and writes the stage's own group of the
     store; `key` is its content key.
     settings(config): the settings that can change the result, as plain JSON values.
@@ -53,19 +53,30 @@ class Stage:
     execute: Callable[[Job, SceneStore, str], Outcome]
     version: int
     reads: tuple[str, ...] = ()
-    per: Literal["scene", "run"] = "run"
     settings: Callable[[RunConfig], dict[str, Any]] = _nothing
     inputs: Callable[[Job, Mapping[str, str]], dict[str, Any]] = _no_inputs
     wanted: Callable[[Job], bool] = _always
     passing: bool = False
 
+    @property
+    def per(self) -> Literal["scene", "run"]:
+        """Done once for a scene, as its arrays in the layout are outside of runs, or once for each run."""
+        return "scene" if self.name in SCENE_STAGES else "run"
 
-def settings_of(name: str, *others: str, without: tuple[str, ...] = ()) -> Callable[[RunConfig], dict[str, Any]]:
-    """Settings of a stage: the section `name` of the configuration but for `without`, and `others` beside it."""
+
+def settings_of(
+    name: str, *others: str, without: Sequence[str] = (), unless: Mapping[str, Any] | None = None
+) -> Callable[[RunConfig], dict[str, Any]]:
+    """Settings of a stage: the section `name` of the configuration but for the fields `without`, and `others` beside.
+
+    unless: fields that are left out where they have this value; results from before there was the field stay valid.
+    """
+    left_out = dict(unless or {})
 
     def settings(config: RunConfig) -> dict[str, Any]:
         document = config.model_dump(mode="json")
         own = {field: value for field, value in document[name].items() if field not in without}
+        own = {field: value for field, value in own.items() if field not in left_out or left_out[field] != value}
         return own | {field: document[field] for field in others}
 
     return settings

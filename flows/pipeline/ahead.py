@@ -39,21 +39,21 @@ def sample_ahead(jobs: Sequence[Job]) -> Totals:
             with _left_to_its_flow(f"{len(works)} runs"):
                 started_at, started = now(), time.monotonic()
                 totals = fan_out(works, works[0].job.config.execution, f"sample {len(works)} runs")
-                write_shares(works, started_at, time.monotonic() - started)
+                write_shares(works, started_at, time.monotonic() - started, totals)
                 return totals
         return Totals()
 
 
-def write_shares(works: Sequence[Work], started_at: str, seconds: float) -> None:
+def write_shares(works: Sequence[Work], started_at: str, seconds: float, totals: Totals) -> None:
     """A row of timings for each run: its share of the seconds, by its number of groups. Its own stage `sample`, which
     finds the views there, takes next to nothing."""
     groups = [sum(len(items) for items in work.passes) for work in works]
     for work, count in zip(works, groups):
         record = StageRecord(
             stage=SAMPLED_AHEAD, key=work.key, started_at=started_at, finished_at=now(),
-            seconds=seconds * count / max(1, sum(groups)), work={"groups": count},
+            seconds=seconds * count / max(1, sum(groups)), work={"groups": count, "workers": totals.workers},
         )  # fmt: skip
-        write_timing(work.job, record)
+        write_timing(work.job, record, totals.usage)
 
 
 @contextlib.contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import platform
-import resource
 import time
 from collections.abc import Callable, Iterator
 from datetime import datetime
@@ -12,6 +11,7 @@ from datetime import datetime
 import numpy as np
 
 from flows.jobs.job import Job
+from flows.jobs.usage import Usage, measured
 from flows.pipeline.keys import Step, pending, stage, upstream
 from flows.pipeline.locks import writing
 from flows.pipeline.versions import provenance
@@ -37,7 +37,8 @@ def execute_stage(job: Job, step: Step) -> StageRecord:
     # Taken back before the data changes: a kill in between must not leave a record of what is no longer there.
     store.forget(step.stage, job.run)
     started_at, started = now(), time.monotonic()
-    outcome = stage(step.stage).execute(job, store, step.key)
+    with measured() as usage:
+        outcome = stage(step.stage).execute(job, store, step.key)
     record = StageRecord(
         stage=step.stage,
         key=step.key,
@@ -51,7 +52,7 @@ def execute_stage(job: Job, step: Step) -> StageRecord:
         decisions=outcome.decisions,
     )
     store.complete(step.stage, record, job.run)
-    write_timing(job, record)
+    write_timing(job, record, usage.with_(outcome.usage))
     for decision in outcome.decisions:
         console.print(f"  [dim]{decision.text}[/dim]")
     return record
@@ -71,15 +72,15 @@ def run_missing(
     return [execute(job, step) for step in steps]
 
 
-def write_timing(job: Job, record: StageRecord) -> None:
+def write_timing(job: Job, record: StageRecord, usage: Usage) -> None:
     """One row per execution in `timings/`; the file's name holds the time, so that earlier executions stay."""
     known = {name: int(value) for name, value in record.work.items() if name in TIMINGS.names}
     row = {
         "scene_id": job.scene_id, "dataset": job.dataset, "run": job.run, "method": job.label,
         "split": job.config.split, "seed": job.config.seed, "key": record.key, "code_version": record.code_version,
         "stage": record.stage, "started_at": datetime.fromisoformat(record.started_at), "seconds": record.seconds,
-        "skipped": False, "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
-        "workers": 1, "device": "cpu", "host": platform.node(), **known,
+        "skipped": False, "peak_memory_bytes": usage.peak_memory_bytes, "workers": 1, "device": usage.device,
+        "host": platform.node(), **known,
     }  # fmt: skip
     stamp = record.started_at.replace(":", "").replace("+", "_")
     append_rows(job.out / "timings", TIMINGS, [row], f"{job.scene_id}.{job.run}.{record.stage}.{stamp}")

@@ -9,7 +9,8 @@ import string
 from pathlib import Path
 
 from flows.errors import InputError
-from flows.jobs.job import Job, Request, SplitError
+from flows.jobs.job import Job, SplitError
+from flows.jobs.request import Request
 from flows.jobs.scene import Scene
 from flows.pipeline.keys import pending
 from flows.progress import console

@@ -19,15 +19,13 @@ from rich.markup import escape
 from rich.table import Column, Table
 from rich.text import Text
 
+from flows.stages import STAGES
 from schemas import arrays
 from schemas.documents import nodes
 from schemas.errors import MissingError, StoreError
-from schemas.layout import SCENE_STAGES, STAGES
+from schemas.layout import markers
 from schemas.scene_store import SceneStore, Section
 from schemas.verify import Problem, orphans, run_of, verify
-
-#: Arrays whose content keys say how many views of a stage are done.
-MARKERS = {"encode": "latents/done_captured", "sample": "generated/done_latent", "decode": "generated/done_image"}
 
 
 def inspect_store(
@@ -131,7 +129,8 @@ def stale_stages(
             record = None
         if record is None:
             continue
-        inputs = [(None if name in SCENE_STAGES else run, name) for name in STAGES[stage]]
+        read = next(one.reads for one in STAGES if one.name == stage)
+        inputs = [(owner, name) for name in read for owner in (None, run)]
         changed = [name for owner, name in inputs if (owner, name) in stale]
         if (run, stage) in expected and record.key not in expected[run, stage]:
             stale[run, stage] = "its inputs, configuration or code have changed"
@@ -244,19 +243,15 @@ def _camera_sections(store: SceneStore) -> list[tuple[str | None, Section]]:
 
 
 def _all_stages(store: SceneStore) -> list[tuple[str | None, str]]:
-    scene: list[tuple[str | None, str]] = [(None, stage) for stage in STAGES if stage in SCENE_STAGES]
-    return scene + [(run, stage) for run in store.runs() for stage in STAGES if stage not in SCENE_STAGES]
+    scene: list[tuple[str | None, str]] = [(None, stage.name) for stage in STAGES if stage.per == "scene"]
+    return scene + [(run, stage.name) for run in store.runs() for stage in STAGES if stage.per == "run"]
 
 
 def _views_done(store: SceneStore, run: str | None, stage: str) -> tuple[int, int] | None:
     """(done, all) views of a stage that works view by view, None where nothing is known of it."""
-    prefix = f"runs/{run}/" if run is not None else ""
-    if stage == "render":
-        markers = sorted(store.folder.glob(f"{prefix}renders/*/done"))
-    else:
-        markers = [store.folder / f"{prefix}{MARKERS[stage]}"] if stage in MARKERS else []
+    patterns = [pattern.replace("runs/*", f"runs/{run}", 1) for pattern in markers(stage)]
     done = total = 0
-    for folder in markers:
+    for folder in sorted(path for pattern in patterns for path in store.folder.glob(pattern)):
         try:
             count = arrays.open_array(folder, writable=False).shape[0]
             rows = arrays.read_views(folder, range(count))

@@ -34,18 +34,12 @@ from flows.reporting.summary import (
     timing_rows,
     title,
 )
-from schemas.layout import STAGES
+from flows.stages import STAGES
 from schemas.scene_store import Run, SceneStore
 from schemas.tables import TIMINGS, read_rows
 
 #: Held-out views shown of each run: all of a few, else this many.
 VIEWS_SHOWN = 3
-#: In sentences on work that was not done.
-SKIPPED = re.compile(
-    r"^(Skipped|Sampled nothing|Trained without|Trained on captured|Went on|Images of half|Proposals were trained at|"
-    r"The LPIPS loss was taken|The field was not asked|Started no workers)|"
-    r"left out|need not be|were saved|are used, chosen"
-)
 SWEEP, PROBLEMS = "sweep.json", "problems.json"
 
 
@@ -75,7 +69,7 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
         "timings": timings,
         "longest": max((t["total"] for t in timings), default=0.0),
         "methods": method_times(timings),
-        "stages": [s for s in STAGES if any(s in t["stages"] for t in timings)],
+        "stages": [s.name for s in STAGES if any(s.name in t["stages"] for t in timings)],
         "shared": shared_savings(timings),
         "skipped": skipped_work(scenes),
         "curve": quality_against_time(rows),
@@ -99,13 +93,13 @@ def scene_section(out: Path, path: Path) -> dict[str, Any]:
     runs = []
     for name in sorted(store.runs(), key=_run_order):
         run = store.run(name)
-        records = {stage: record for stage in STAGES if (record := store.record(stage, name))}
+        records = {s.name: record for s in STAGES if (record := store.record(s.name, name))}
         folder = out / store.scene_id / name
         runs.append(
             {
                 "name": name,
                 "views": view_pictures(store, run, truths) if "render" in records else [],
-                "decisions": {stage: [d.text for d in record.decisions] for stage, record in records.items()},
+                "decisions": {stage: record.decisions for stage, record in records.items() if record.decisions},
                 "codes": {stage: record.code_version for stage, record in records.items()},
                 "model": records["sample"].inputs.get("model", "") if "sample" in records else "",
                 "config": run.attrs.get("job", {}).get("config", {}),
@@ -169,20 +163,21 @@ def quality_against_time(rows: Sequence[dict[str, Any]]) -> str | None:
 
 
 def skipped_work(scenes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Sentences on skipped work with the number of runs they are true of; those that differ in numbers only are one."""
+    """Work that was not done: a row for each stage and switch (or sentence, numbers aside, where no switch did it),
+    with the number of runs it is true of and what they saved together, by unit."""
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for scene in scenes:
         for run in scene["runs"]:
-            for stage, sentences in run["decisions"].items():
-                for sentence in sentences:
-                    if SKIPPED.search(sentence):
-                        kind = (stage, re.sub(r"[\d.,%]+", "#", sentence))
-                        entry = found.setdefault(
-                            kind, {"stage": stage, "sentence": sentence, "runs": 0, "alike": False}
-                        )
-                        entry["runs"] += 1
-                        entry["alike"] |= sentence != entry["sentence"]
-    return list(found.values())
+            skips = [(s, d) for s, decisions in run["decisions"].items() for d in decisions if d.kind == "skipped"]
+            for stage, decision in skips:
+                kind = (stage, decision.switch or re.sub(r"[\d.,%]+", "#", decision.text))
+                row = {"stage": stage, "switch": decision.switch or "", "sentence": decision.text, "runs": set()}
+                entry = found.setdefault(kind, row | {"alike": False, "saved": defaultdict(float)})
+                entry["runs"].add((scene["id"], run["name"]))
+                entry["alike"] |= decision.text != entry["sentence"]
+                for unit, count in decision.saved.items():
+                    entry["saved"][unit] += count
+    return [entry | {"runs": len(entry["runs"])} for entry in found.values()]
 
 
 def versions(out: Path, scenes: Sequence[dict[str, Any]]) -> dict[str, list[str]]:

@@ -13,10 +13,11 @@ from rich.table import Table
 
 from cat3d_core.metrics import measures
 from cat3d_core.metrics.measures import Metric
+from flows.jobs.metric_table import metric_table
 from flows.progress import console
-from flows.reporting.metric_table import metric_table
 from flows.reporting.published import PUBLISHED
-from schemas.layout import SCENE_STAGES, STAGES
+from flows.stages import STAGES
+from schemas.layout import SCENE_STAGES
 from schemas.tables import TIMINGS, read_rows
 
 #: Rows of timings that belong to a stage: sampling for all runs of a sweep at once, before their own flows.
@@ -154,9 +155,10 @@ def timing_rows(out: Path) -> list[dict[str, Any]]:
     for scene, run in runs:
         stages = {}
         for stage in STAGES:
-            row = latest.get((scene, "" if stage in SCENE_STAGES else run, stage))
-            if row and not (stage == "encode" and (scene, run, "sample") not in latest):
-                stages[stage] = row["seconds"]
+            row = latest.get((scene, run if stage.per == "run" else "", stage.name))
+            users = [(scene, run, other.name) for other in STAGES if stage.name in other.reads]
+            if row and not (stage.passing and not latest.keys() & set(users)):
+                stages[stage.name] = row["seconds"]
         method = next(r["method"] for (s, name, _), r in latest.items() if (s, name) == (scene, run))
         row = {"scene_id": scene, "run": run, "method": method, "stages": stages, "total": sum(stages.values())}
         out_rows.append(row)
@@ -168,7 +170,7 @@ def method_times(timings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     rows = []
     for method in sorted({t["method"] for t in timings}, key=method_order):
         own = [t for t in timings if t["method"] == method]
-        stages = {s: sum(t["stages"].get(s, 0.0) for t in own) / len(own) for s in STAGES}
+        stages = {s.name: sum(t["stages"].get(s.name, 0.0) for t in own) / len(own) for s in STAGES}
         stages = {s: v for s, v in stages.items() if v}
         rows.append({"method": method, "runs": len(own), "stages": stages, "total": sum(stages.values())})
     return rows

@@ -62,6 +62,4 @@ def encode_views(job: Job, store: SceneStore, key: str, kind: str, views: list[i
     return len(missing)
 
 
-STAGE = Stage(
-    "encode", execute, version=1, reads=("poses",), per="scene", inputs=inputs, wanted=generates, passing=True
-)
+STAGE = Stage("encode", execute, version=1, reads=("poses",), inputs=inputs, wanted=generates, passing=True)

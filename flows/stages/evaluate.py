@@ -14,9 +14,9 @@ from cat3d_core.metrics.measures import PERCEPTUAL, Comparison, Network
 from cat3d_core.metrics.protocols import PROTOCOLS
 from flows.jobs.access import read_cameras, read_similarity, views_with_role
 from flows.jobs.job import Job, Outcome
+from flows.jobs.metric_table import metric_table
 from flows.jobs.stage import Stage, settings_of
 from flows.progress import meter
-from flows.reporting.metric_table import metric_table
 from flows.stages import render
 from schemas.content_key import content_key
 from schemas.decisions import skipped, warning

@@ -127,4 +127,4 @@ def ingest_view(
     return Ingested(image, mask, small)
 
 
-STAGE = Stage("ingest", execute, version=1, per="scene", settings=settings_of("ingest"), inputs=inputs)
+STAGE = Stage("ingest", execute, version=1, settings=settings_of("ingest"), inputs=inputs)

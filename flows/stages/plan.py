@@ -41,7 +41,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     run = store.run(job.run)
     plan, train = plan_run(job, store, run)
     write_plan(run, plan, train, store.captured.shape("size")[0])
-    from flows.reporting.plan_drawing import (
+    from flows.media.plan_drawing import (
         draw_plan,  # matplotlib: a second, which asking what is to do should not cost
     )
 

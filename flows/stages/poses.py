@@ -133,6 +133,4 @@ def write_poses(
     )
 
 
-STAGE = Stage(
-    "poses", execute, version=1, reads=("ingest",), per="scene", settings=settings_of("poses", "seed"), inputs=inputs
-)
+STAGE = Stage("poses", execute, version=1, reads=("ingest",), settings=settings_of("poses", "seed"), inputs=inputs)

@@ -15,19 +15,12 @@ from flows.progress import meter
 from flows.reconstruction.open import open_reconstructor
 from flows.reconstruction.stored import Checkpoint, write_reconstruction
 from flows.stages.training_views import training_views
-from schemas.config import RunConfig
 from schemas.decisions import Decision, skipped
 from schemas.scene_store import SceneStore
 
 CHECKPOINT_INTERVAL_S = 20.0
 #: A row of the training record at every so many steps.
 RECORD_EVERY = 10
-
-
-def settings(config: RunConfig) -> dict[str, Any]:
-    """The section `reconstruct`; the method, which is younger than stored fields, where it is not what they are."""
-    own = settings_of("reconstruct", "seed")(config)
-    return {name: value for name, value in own.items() if (name, value) != ("method", "zipnerf")}
 
 
 def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
@@ -83,6 +76,6 @@ STAGE = Stage(
     execute,
     version=5,
     reads=("poses", "decode"),
-    settings=settings,
+    settings=settings_of("reconstruct", "seed", unless={"method": "zipnerf"}),
     inputs=inputs,
 )

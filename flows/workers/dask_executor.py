@@ -20,7 +20,7 @@ from prefect import task
 from prefect.cache_policies import NO_CACHE
 from prefect_dask.client import PrefectDaskClient
 
-from flows.workers.local import visible_gpus
+from flows.jobs.device import visible_gpus
 from flows.workers.work import Answer, Batch, run_batch
 from schemas.config import ExecutionConfig
 from schemas.errors import ConfigError

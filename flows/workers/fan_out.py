@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from flows.errors import WorkerError
+from flows.jobs.usage import Usage
 from flows.progress import Meter, meter
 from flows.workers.executors import Executor, open_executor
 from flows.workers.work import Answer, Batch, Work, run_batch
@@ -33,14 +34,16 @@ class Totals:
     busy_seconds: float = 0.0
     loading_seconds: float = 0.0
     decisions: list[Decision] = field(default_factory=list)
+    usage: Usage = field(default_factory=Usage)
 
     def __add__(self, other: Totals) -> Totals:
-        summed = {name: getattr(self, name) + getattr(other, name) for name in vars(self) if name != "workers"}
-        return Totals(max(self.workers, other.workers), **summed)
+        summed = {n: getattr(self, n) + getattr(other, n) for n in vars(self) if n not in ("workers", "usage")}
+        return Totals(max(self.workers, other.workers), **summed, usage=self.usage.with_(other.usage))
 
     def work(self) -> dict[str, float]:
         """Counts for the stage's record."""
-        return {name: value for name, value in vars(self).items() if name != "decisions" and self.workers}
+        counts = ("workers", "batches", "busy_seconds", "loading_seconds")
+        return {name: getattr(self, name) for name in counts if self.workers}
 
 
 @dataclass
@@ -95,7 +98,7 @@ def _done_here(works: Sequence[Work], settings: ExecutionConfig, progress: Meter
                 answer.raise_error()
                 del items[: len(batch)]
                 progress.advance(sum(len(work.views[i]) for i in batch))
-                totals += Totals(1, 1, answer.seconds, answer.loading_seconds)
+                totals += Totals(1, 1, answer.seconds, answer.loading_seconds, usage=answer.usage)
                 each = answer.seconds / len(batch)
                 if each * sum(len(items) for work in works for items in work.passes) > settings.batch_seconds:
                     return totals
@@ -167,6 +170,7 @@ class _Sharing:
         self.totals.batches += 1
         self.totals.busy_seconds += answer.seconds
         self.totals.loading_seconds += answer.loading_seconds
+        self.totals.usage = self.totals.usage.with_(answer.usage)
         self.item_seconds = answer.seconds / len(out.batch.items)
         self._advance(out, len(out.left))
 

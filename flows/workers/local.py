@@ -11,8 +11,7 @@ import sys
 from pathlib import Path
 from typing import BinaryIO, cast
 
-import torch
-
+from flows.jobs.device import visible_gpus
 from flows.workers.work import Answer, Batch
 from schemas.config import ExecutionConfig
 
@@ -103,13 +102,6 @@ class _Worker:
                 process_group=0,  # Ctrl-C is for this process, which then ends its workers
             )  # fmt: skip
         self.stdin, self.stdout = cast(BinaryIO, self.process.stdin), cast(BinaryIO, self.process.stdout)
-
-
-def visible_gpus() -> list[str]:
-    """The GPUs this process may use, as CUDA_VISIBLE_DEVICES names them."""
-    given = os.environ.get("CUDA_VISIBLE_DEVICES")
-    count = torch.cuda.device_count()
-    return given.split(",")[:count] if given else [str(i) for i in range(count)]
 
 
 def _how(code: int) -> str:

@@ -6,12 +6,13 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 
-from pydantic import BaseModel, ConfigDict, ImportString
+from pydantic import BaseModel, ConfigDict, Field, ImportString
 
 from cat3d_core.reconstruction import NonFiniteError
 from flows.errors import InputError, WorkerError
 from flows.jobs.device import cpu_threads
 from flows.jobs.job import Job
+from flows.jobs.usage import Usage, measured
 from schemas.errors import ConfigError, StoreError
 from schemas.scene_store import SceneStore, Section
 
@@ -40,11 +41,12 @@ class Batch(BaseModel):
 
 
 class Answer(BaseModel):
-    """What a worker did with a batch. `died`: the worker, not the work, failed. Seconds are the worker's."""
+    """What a worker did with a batch. `died`: the worker, not the work, failed. Seconds and usage are the worker's."""
 
     number: int
     seconds: float = 0.0
     loading_seconds: float = 0.0
+    usage: Usage = Field(default_factory=Usage)
     died: str = ""
     error: str = ""
     message: str = ""
@@ -59,7 +61,7 @@ def run_batch(batch: Batch) -> Answer:
     """Do a batch in this process, with the job's number of threads."""
     started = loaded = time.monotonic()
     try:
-        with cpu_threads(batch.job.config.execution.threads):
+        with measured() as usage, cpu_threads(batch.job.config.execution.threads):
             batch.load(batch.job)
             loaded = time.monotonic()
             store = SceneStore.open(batch.job.store_path, "r+")
@@ -69,7 +71,7 @@ def run_batch(batch: Batch) -> Answer:
         message = str(error) if kind in KNOWN_ERRORS else traceback.format_exc()
         return Answer(number=batch.number, error=kind, message=message)
     ended = time.monotonic()
-    return Answer(number=batch.number, seconds=ended - loaded, loading_seconds=loaded - started)
+    return Answer(number=batch.number, seconds=ended - loaded, loading_seconds=loaded - started, usage=usage)
 
 
 def is_done(section: Section, marker: str, view: int, key: str, data: str | None = None) -> bool:

@@ -70,7 +70,7 @@ check() {
   mkdir -p "$1" "$WORK"
   site
   "$PYTHON" -m pytest -q --noconftest -p no:cacheprovider tests/core/zipnerf/test_hash_grid_triton.py -k compiled 2>&1 | tee "$1/kernel_test.log"
-  "$PYTHON" infra/gpu/check.py "$1" "${@:2}"
+  "$PYTHON" -m flows.bench.gpu "$1" "${@:2}"
 }
 
 case "${1:-}" in

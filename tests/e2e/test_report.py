@@ -12,8 +12,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from flows.jobs.metric_table import metric_table
 from flows.reporting.charts import Point, Series, chart, log_ticks, ticks
-from flows.reporting.metric_table import metric_table
 from flows.reporting.published import PUBLISHED
 from flows.reporting.report import write_report
 from flows.reporting.summary import paper_tables, summary_rows, timing_rows

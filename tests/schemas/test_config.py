@@ -10,6 +10,7 @@ import pytest
 from schemas.config import RunConfig, json_schema, load_config, parse_config
 from schemas.content_key import content_key
 from schemas.errors import ConfigError
+from schemas.settings import merged
 
 
 def test_yaml_and_json_say_the_same(tmp_path: Path) -> None:
@@ -25,7 +26,7 @@ def test_yaml_and_json_say_the_same(tmp_path: Path) -> None:
 
 
 def test_a_config_goes_through_json_and_back() -> None:
-    config = RunConfig(method="cat3d", seed=3)
+    config = RunConfig(generate="always", seed=3)
     assert parse_config(json.loads(config.model_dump_json()), "x") == config
 
 
@@ -33,7 +34,7 @@ def test_a_config_goes_through_json_and_back() -> None:
     ("text", "sentence"),
     [
         ("plan: {viewz: 3}", "plan.viewz is not a setting; the settings here are trajectory, views"),
-        ("viewz: 3", "viewz is not a setting; the settings here are method, label, split, seed"),
+        ("viewz: 3", "viewz is not a setting; the settings here are generate, label, split, seed"),
         ("seed: -1", "seed is -1, but input should be greater than or equal to 0"),
         ("seed: 1.5", "seed is 1.5, but input should be a valid integer"),
         ("ingest: {downscale: 0}", "ingest.downscale is 0, but input should be greater than or equal to 1"),
@@ -80,3 +81,15 @@ def test_the_json_schema_describes_every_field() -> None:
         assert model["additionalProperties"] is False
         for name, field in model["properties"].items():
             assert "description" in field or "$ref" in field, name
+
+
+def test_a_short_name_of_earlier_versions_stands_for_what_is_generated_and_how_it_is_reconstructed() -> None:
+    assert RunConfig().generate == "auto"
+    assert parse_config({"method": "cat3d"}, "test").generate == "always"
+    baseline = parse_config({"method": "zipnerf"}, "test")
+    assert (baseline.generate, baseline.reconstruct.method) == ("never", "zipnerf")
+    assert merged({"generate": "never"}, {"method": "cat3d"})["generate"] == "always", "later settings win"
+    with pytest.raises(ConfigError, match="run.yaml: method cat3d stands for generate always, but generate is never"):
+        parse_config({"method": "cat3d", "generate": "never"}, "run.yaml")
+    with pytest.raises(ConfigError, match="run.yaml: method is 'nerf'; it may be auto, zipnerf, cat3d"):
+        parse_config({"method": "nerf"}, "run.yaml")

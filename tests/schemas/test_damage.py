@@ -99,7 +99,7 @@ def test_a_chunk_may_be_missing_where_its_stage_is_not_complete_or_its_view_left
         ("missing", "runs/v3/generated/done_latent", (1, 0)),
         ("missing", "runs/v3/generated/latent", (1, 0, 0, 0)),
     ]
-    store.invalidate("sample", "v3")
+    store.invalidate(["sample", "decode", "reconstruct", "render"], "v3")
     assert _problems(store) == []
     (generated.folder / "latent" / "c.2.0.0.0").unlink()  # marked as done, so it should be there
     assert _problems(store) == [("missing", "runs/v3/generated/latent", (2, 0, 0, 0))]
@@ -143,7 +143,7 @@ def test_a_damaged_record_is_named(store: SceneStore) -> None:
     with pytest.raises(StoreError, match="record .*poses is damaged .*: remove it and run the stage again"):
         store.record("poses")
     assert _problems(store) == [("corrupted", "stages/poses", None)]
-    store.invalidate("poses")
+    store.invalidate(["poses", "plan", "encode", "sample", "decode", "reconstruct", "render"])
     assert store.record("poses") is None
 
 

@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 from flows.cli import app
 from flows.commands.reprocess import clone_path, expected_costs, find_stale, make_clone, recover, redo, replace_store
 from flows.errors import InputError
+from flows.jobs.metric_table import metric_table
 from flows.media import images
 from flows.pipeline.sweep import run_sweep
-from flows.reporting.metric_table import metric_table
 from flows.reporting.summary import timing_rows
 from schemas.config import SweepConfig, parse_config
 from schemas.scene_store import SceneStore

@@ -29,7 +29,6 @@ from flows.bench.geometry import mesh_row, sample_surface, true_depths
 from flows.bench.reconstruct import procedural_views
 from flows.cli import app
 from flows.commands.export import SurfaceSettings, export_command
-from flows.commands.run import make_config
 from flows.errors import InputError
 from flows.exports import mesh as meshes
 from flows.exports.dataset import write_dataset
@@ -38,6 +37,7 @@ from flows.exports.ply import write_ply
 from flows.exports.source import open_source, training_images
 from flows.exports.splat_files import READERS
 from flows.jobs.access import read_cameras
+from flows.jobs.request import make_config
 from flows.media.images import read_image
 from flows.pipeline.runner import opened, run_missing
 from flows.readers import read_capture
@@ -265,7 +265,7 @@ OVERRIDES = (
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with a field and a rendered path, made without a server."""
-    from flows.jobs.job import Request
+    from flows.jobs.request import Request
 
     out = tmp_path_factory.mktemp("exports")
     config = make_config({"method": "zipnerf", "preset": "fast"}, None, [OVERRIDES, "render.path_views=2"])

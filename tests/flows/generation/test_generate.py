@@ -10,10 +10,10 @@ import torch
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.sample_sets import source_boxes
-from flows.commands.run import make_config
 from flows.errors import InputError
 from flows.generation.groups import StoredPlan
-from flows.jobs.job import Job, Request
+from flows.jobs.job import Job
+from flows.jobs.request import Request, make_config, make_request
 from flows.media.images import PADDING, read_image, square_image
 from flows.pipeline.keys import pending
 from flows.stages.training_views import generated_views, no_finer
@@ -65,7 +65,7 @@ def test_the_plan_is_printed_drawn_and_stored_before_anything_is_sampled(model: 
 
     settings = [f"sample.checkpoint={model}", "skip=none"]
     given = {"trajectory": "single_orbit", "count": 20}
-    (job,) = plan_command(SCENE, tmp_path, ["1"], given, settings=settings)
+    (job,) = plan_command(make_request(SCENE, tmp_path, "1", given | {"method": "cat3d"}, settings=settings))
     printed = " ".join(capfd.readouterr().out.split())
     assert "single_orbit: 20 views in" in printed
     assert "anchors" in printed

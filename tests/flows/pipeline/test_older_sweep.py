@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from flows.jobs.metric_table import metric_table
 from flows.pipeline.sweep import open_jobs, run_sweep, sweep_jobs
-from flows.reporting.metric_table import metric_table
 from schemas.config import SweepConfig, load_config
 from schemas.tables import TIMINGS, read_rows
 

@@ -13,10 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flows.commands.run import make_config
-from flows.jobs.job import Request
+from flows.jobs.metric_table import metric_table
+from flows.jobs.request import Request, make_config
 from flows.pipeline.keys import pending
-from flows.reporting.metric_table import metric_table
 from schemas.scene_store import SceneStore
 from schemas.tables import TIMINGS, read_rows
 from tests.flows.conftest import ROOT, SCENE, TINY, command, environment

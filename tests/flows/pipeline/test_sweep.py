@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from flows.cli import app
 from flows.commands.results import compare
+from flows.jobs.metric_table import metric_table
 from flows.pipeline.sweep import open_jobs, run_sweep, sweep_jobs
-from flows.reporting.metric_table import metric_table
 from schemas.config import SceneSource, SweepConfig, parse_config
 from schemas.settings import merged
 from schemas.tables import TIMINGS, append_rows, read_rows

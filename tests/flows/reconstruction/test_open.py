@@ -10,10 +10,10 @@ import torch
 
 from cat3d_core.reconstruction import Reconstructor
 from cat3d_core.zipnerf import ZipNerf
-from flows.commands.run import make_config
 from flows.errors import InputError
 from flows.jobs.access import read_cameras
-from flows.jobs.job import Job, Request
+from flows.jobs.job import Job
+from flows.jobs.request import Request, make_config
 from flows.media.images import to_uint8
 from flows.reconstruction.open import open_reconstructor
 from flows.reconstruction.stored import read_reconstruction

@@ -18,14 +18,14 @@ from cat3d_core.diffusion.sampler import SamplerConfig
 from cat3d_core.metrics import measures
 from cat3d_core.metrics.measures import Comparison, Metric
 from flows.commands.results import compare
-from flows.commands.run import make_config
 from flows.exports.source import open_source, render_views
 from flows.jobs.access import read_cameras
-from flows.jobs.job import Job, Request
+from flows.jobs.job import Job
+from flows.jobs.metric_table import metric_table
+from flows.jobs.request import Request, make_config
 from flows.pipeline.keys import expected_steps, pending
 from flows.reconstruction.open import GROUP
 from flows.reconstruction.stored import read_reconstruction
-from flows.reporting.metric_table import metric_table
 from flows.reporting.report import write_report
 from flows.reporting.summary import summary_rows
 from schemas.scene_store import SceneStore

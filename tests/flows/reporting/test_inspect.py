@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from flows.pipeline.keys import downstream
 from flows.reporting.inspect import as_text, inspect_store, stale_stages
 from schemas.errors import StoreError
 from schemas.scene_store import SceneStore, StageRecord
@@ -164,7 +165,7 @@ def _rewrite(path: str) -> None:
 
 
 def test_a_store_is_inspected_while_it_is_rewritten(store: SceneStore) -> None:
-    store.invalidate("ingest")
+    store.invalidate(downstream("ingest"))
     writer = mp.get_context("forkserver").Process(target=_rewrite, args=(str(store.root),))
     writer.start()
     looks = 0

@@ -14,11 +14,11 @@ from cat3d_core.plan import PlanConfig, make_plan
 from cat3d_core.reconstruction import Views
 from cat3d_core.zipnerf import Trainer, ZipNerfConfig
 from cat3d_core.zipnerf.settings import config_from_document, fitted, left_out
-from flows.commands.run import make_config
 from flows.generation.groups import StoredPlan
 from flows.generation.model import shared_model
 from flows.jobs.access import read_cameras, read_images
-from flows.jobs.job import Job, Request
+from flows.jobs.job import Job
+from flows.jobs.request import Request, make_config
 from flows.media.images import to_uint8
 from flows.pipeline.keys import expected_steps
 from flows.reconstruction.open import open_reconstructor

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from cat3d_core.diffusion import SIZES, MultiViewModel, save_model
-from flows.commands.run import make_config
-from flows.jobs.job import Job, Request
+from flows.jobs.job import Job
+from flows.jobs.request import Request, make_config
 from flows.pipeline.keys import pending
 from flows.pipeline.runner import execute_stage, opened, prepare_run
 from schemas.scene_store import Run, SceneStore

@@ -11,7 +11,7 @@ from flows.generation.groups import StoredPlan
 from flows.generation.model import sampler_config, shared_model
 from flows.generation.shrinking import sample_at_most
 from flows.jobs.job import Job
-from flows.pipeline.keys import Step, expected_steps
+from flows.pipeline.keys import Step, downstream, expected_steps
 from flows.stages import sample as sample_stage
 from flows.stages.sample import alike, network_inputs, sample_work
 from flows.workers import fan_out as fan_out_module
@@ -117,7 +117,7 @@ def test_a_corrupted_latent_is_found_and_made_again(scene, expected) -> None:
     data[100] ^= 4
     chunk.write_bytes(bytes(data))
     store = SceneStore.open(job.store_path, "r+")
-    store.invalidate("sample", job.run)
+    store.invalidate(downstream("sample"), job.run)
     record = run_stages(job, "sample")["sample"]
     assert record.work["groups"] == 1
     after = chunk_times(job)
@@ -158,7 +158,7 @@ def test_decoding_is_a_stage_of_its_own_and_does_what_is_missing(scene) -> None:
     assert images.shape == (24, 64, 64, 3)
     assert images.std() > 1
     (generated.folder / "done_image" / "c.3.0").unlink()
-    SceneStore.open(job.store_path, "r+").invalidate("decode", job.run)
+    SceneStore.open(job.store_path, "r+").invalidate(downstream("decode"), job.run)
     assert run_stages(job, "decode")["decode"].work["views"] == 1
     assert np.array_equal(generated.read("image"), images)
 

@@ -21,6 +21,7 @@ import pytest
 
 from flows.errors import WorkerError
 from flows.jobs.job import Job
+from flows.pipeline.keys import downstream
 from schemas.documents import leftovers
 from schemas.scene_store import SceneStore
 from schemas.verify import verify
@@ -186,7 +187,7 @@ def test_thirty_kills_of_workers_and_parents_at_random_moments(scene, expected) 
             for view in rng.sample(range(24), 12):
                 (folder / "done_latent" / f"c.{view}.0").unlink(missing_ok=True)
                 seen.pop(view, None)
-            SceneStore.open(job.store_path, "r+").invalidate("sample", job.run)
+            SceneStore.open(job.store_path, "r+").invalidate(downstream("sample"), job.run)
             process = start(job)
             continue
         workers = workers_of(process.pid)

@@ -1,6 +1,6 @@
 """The GPU's numbers of the reconstruction: kernels side by side, and the paper's two jobs against the clock.
 
-    python infra/gpu/check.py OUT [--seconds 90]      # OUT/kernels.json, OUT/jobs.json; tables on the screen
+    python -m flows.bench.gpu OUT [--seconds 90]      # OUT/kernels.json, OUT/jobs.json; tables on the screen
 
 The jobs are the preset `paper` with the paper's rays a step (CAT3D, app. 'Details of 3D Reconstruction'), 1,000 steps.
 Each goes on for at most `--seconds`; where that is not enough the time of all steps is that of the measured ones scaled
@@ -40,7 +40,7 @@ def job(name: str, preset: str, rays: int, size: int, seconds: float, device: st
         synchronize(device)
         steps += 1
     spent = time.perf_counter() - started
-    row = {
+    row: dict[str, Any] = {
         "job": name,
         "preset": preset,
         "rays": rays,

@@ -12,8 +12,8 @@ from rich.console import Console
 
 from cat3d_core.plan import PlanConfig, make_plan
 from cat3d_core.trajectories import FreeSpace
+from flows.media.plan_drawing import draw_plan, plan_table
 from flows.readers import read_capture
-from flows.reporting.plan_drawing import draw_plan, plan_table
 from tests.core.plan.layouts import ring, single
 
 # What a person would choose for each capture, looking at it.
