@@ -17,9 +17,9 @@ from cat3d_core.splats.reference import (
     LEAST_RATIO,
     MOST_ALPHA,
     NEAR,
+    STEEPEST,
     Raster,
     Window,
-    slopes,
     whole,
 )  # fmt: skip
 
@@ -46,8 +46,8 @@ def _camera(camera: Cameras, antialias: bool, dtype: torch.dtype) -> Tensor:
     pose, k = camera.camera_from_world[0], camera.intrinsics[0]
     lens = torch.stack([k[0, 0], k[0, 1], k[0, 2], k[1, 1], k[1, 2]])
     ratio = LEAST_RATIO if antialias else -1.0
-    rest = torch.tensor([NEAR, BLUR, ratio, LEAST_ALPHA, MOST_ALPHA, LEAST_LIGHT], dtype=torch.float64)
-    return torch.cat([pose[:3, :3].reshape(-1), pose[:3, 3], lens, slopes(camera), rest]).to(dtype).contiguous()
+    rest = torch.tensor([STEEPEST, NEAR, BLUR, ratio, LEAST_ALPHA, MOST_ALPHA, LEAST_LIGHT], dtype=torch.float64)
+    return torch.cat([pose[:3, :3].reshape(-1), pose[:3, 3], lens, rest]).to(dtype).contiguous()
 
 
 class _Rasterize(torch.autograd.Function):

@@ -20,7 +20,7 @@ from cat3d_core.splats import rasterize_cpu, rasterize_gsplat
 from cat3d_core.splats.config import PRESETS, SplatConfig
 from cat3d_core.splats.gaussians import Gaussians
 from cat3d_core.splats.rasterize import render
-from cat3d_core.splats.trainer import SplatTrainer
+from cat3d_core.splats.trainer import SplatTrainer, splats_of_state
 
 
 class Splats:
@@ -48,6 +48,11 @@ class Splats:
     def from_tensors(cls, settings: Mapping[str, Any], tensors: Mapping[str, Tensor], device: str) -> Self:
         _config(settings["splats"])
         return cls(settings, gaussians=Gaussians.from_tensors(tensors).to(device))
+
+    @classmethod
+    def from_state(cls, settings: Mapping[str, Any], state: Mapping[str, Tensor], device: str) -> Self:
+        """As `from_tensors`, from the `state` of a training under way."""
+        return cls.from_tensors(settings, splats_of_state(state), device)
 
     @property
     def trainer(self) -> SplatTrainer:

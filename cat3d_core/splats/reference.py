@@ -22,8 +22,9 @@ BLUR = 0.3
 """Variance (pixels^2) that is added to each image, so that none is thinner than a pixel."""
 LEAST_RATIO = 2.5e-5
 """Smallest ratio of areas squared before and after that blur; below it the opacity falls no further."""
-FIELD = 1.3
-"""The projection is linearised at most this many half images beside the centre of the image."""
+STEEPEST = 1.5
+"""The projection is linearised at x/z and y/z of at most this (56 degrees), beyond which it would tear images out to
+any length. Independent of the image's size, so that a part of an image looks like the same part of the whole."""
 LEAST_ALPHA = 1.0 / 255.0
 MOST_ALPHA = 0.999
 LEAST_LIGHT = 1e-4
@@ -67,15 +68,6 @@ def whole(camera: Cameras) -> Window:
     return Window(0, 0, width, height)
 
 
-def slopes(camera: Cameras) -> Tensor:
-    """(4,) least and greatest x/z, then y/z, at which the projection is linearised (see FIELD)."""
-    k, size = camera.intrinsics[0], camera.size[0].to(camera.intrinsics)
-    focal, centre = torch.stack([k[0, 0], k[1, 1]]), torch.stack([k[0, 2], k[1, 2]])
-    half = 0.5 * size / focal
-    middle = (0.5 * size - centre) / focal
-    return torch.stack([middle - FIELD * half, middle + FIELD * half], -1).reshape(4)
-
-
 def project(
     means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, camera: Cameras, antialias: bool = True
 ) -> Projected:
@@ -89,9 +81,7 @@ def project(
     depth = view[:, 2]
     safe = torch.where(depth > NEAR, depth, 1.0)
     ratio = view[:, :2] / safe[:, None]
-    limits = slopes(camera)
-    x = torch.minimum(torch.maximum(ratio[:, 0], limits[0]), limits[1])
-    y = torch.minimum(torch.maximum(ratio[:, 1], limits[2]), limits[3])
+    x, y = ratio.clamp(-STEEPEST, STEEPEST).unbind(1)
     zero = torch.zeros_like(x)
     fx, skew, fy = k[0, 0].expand_as(x), k[0, 1].expand_as(x), k[1, 1].expand_as(x)
     jacobian = torch.stack([fx, skew, -(fx * x + skew * y), zero, fy, -fy * y], -1).view(-1, 2, 3) / safe[:, None, None]

@@ -27,7 +27,7 @@ template <typename R>
 struct Camera {
     R rotation[3][3], translation[3];  // camera from world
     R fx, skew, cx, fy, cy;
-    R low_x, high_x, low_y, high_y;    // x/z and y/z at which the projection is linearised
+    R steepest;                        // greatest x/z and y/z at which the projection is linearised
     R near, blur, least_ratio;         // least_ratio < 0: opacities stay as they are
     R least_alpha, most_alpha, least_light;
 };
@@ -62,8 +62,8 @@ bool steps_of(Steps<R>& s, const R* mean, const R* quaternion, const R* scale, c
     for (int i = 0; i < 3; ++i) view[i] = k.rotation[i][0] * mean[0] + k.rotation[i][1] * mean[1] + k.rotation[i][2] * mean[2] + k.translation[i];
     s.x = view[0]; s.y = view[1]; s.z = view[2];
     if (!(s.z > k.near)) return false;
-    s.slope_x = std::min(std::max(s.x / s.z, k.low_x), k.high_x);
-    s.slope_y = std::min(std::max(s.y / s.z, k.low_y), k.high_y);
+    s.slope_x = std::min(std::max(s.x / s.z, -k.steepest), k.steepest);
+    s.slope_y = std::min(std::max(s.y / s.z, -k.steepest), k.steepest);
     const R inverse = 1 / s.z;
     s.jacobian[0][0] = k.fx * inverse; s.jacobian[0][1] = k.skew * inverse; s.jacobian[0][2] = -(k.fx * s.slope_x + k.skew * s.slope_y) * inverse;
     s.jacobian[1][0] = 0; s.jacobian[1][1] = k.fy * inverse; s.jacobian[1][2] = -k.fy * s.slope_y * inverse;
@@ -347,8 +347,8 @@ void gaussian_gradient(const R* g, const R* mean, const R* quaternion, const R* 
     R g_z = g[6];
     for (int j = 0; j < 3; ++j) g_z -= (g_jacobian[0][j] * s.jacobian[0][j] + g_jacobian[1][j] * s.jacobian[1][j]) * z;
     R g_rx = g[0] * k.fx, g_ry = g[0] * k.skew + g[1] * k.fy;
-    if (rx > k.low_x && rx < k.high_x) g_rx -= g_jacobian[0][2] * k.fx * z;
-    if (ry > k.low_y && ry < k.high_y) g_ry -= (g_jacobian[0][2] * k.skew + g_jacobian[1][2] * k.fy) * z;
+    if (std::abs(rx) < k.steepest) g_rx -= g_jacobian[0][2] * k.fx * z;
+    if (std::abs(ry) < k.steepest) g_ry -= (g_jacobian[0][2] * k.skew + g_jacobian[1][2] * k.fy) * z;
     g_z -= (g_rx * rx + g_ry * ry) * z;
     for (int j = 0; j < 3; ++j) mean_out[j] = (g_rx * k.rotation[0][j] + g_ry * k.rotation[1][j]) * z + g_z * k.rotation[2][j];
     const R w_ = quaternion[0] / s.norm, x_ = quaternion[1] / s.norm, y_ = quaternion[2] / s.norm, z_ = quaternion[3] / s.norm;

@@ -256,11 +256,14 @@ class SplatTrainer:
         self.iteration, self.skipped = int(state["trainer.iteration"]), int(state["trainer.skipped"])
 
 
+def splats_of_state(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors of the Gaussians that a `SplatTrainer.state` holds."""
+    found = {n.removeprefix("splats."): v for n, v in state.items() if n.startswith("splats.")}
+    return found | {"means": expand(found["means"])}
+
+
 def train(trainer: SplatTrainer) -> Gaussians:
     """Run the training to its end."""
     while not trainer.finished:
         trainer.step()
     return Gaussians(**{name: value.detach() for name, value in trainer.gaussians.tensors().items()})
-
-
-__all__ = ["SplatTrainer", "expand", "train"]

@@ -30,7 +30,7 @@ def _inputs(draw: Draw, count: int = _COUNT) -> tuple[Tensor, ...]:
     """Gaussians before the camera and beside its image, from a thousandth of a pixel to a hundred pixels wide, needles
     and sheets of 1 : 10^4 among them."""
     depth = draw.log_between(count, 0.02, 100.0)
-    beside = draw.between(2 * count, -1.0, 1.0).view(-1, count, 2)
+    beside = draw.between(2 * count, -2.0, 2.0).view(-1, count, 2)
     means = torch.cat([beside * depth[..., None], depth[..., None]], -1)
     quaternions = draw.normal(4 * count).view(-1, count, 4)
     quaternions = torch.where(quaternions.norm(dim=-1, keepdim=True) > 1e-3, quaternions, 1.0)
@@ -51,9 +51,9 @@ def _project(means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tens
 def _project_exact(means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor) -> Exact:
     """The image's covariance as a product of whole matrices, its inverse as the adjugate over the determinant; what it
     covers without the blur from its singular values."""
-    k, limits = _camera(DOUBLE).intrinsics[0], reference.slopes(_camera(DOUBLE))
-    u = (means[..., 0] / means[..., 2]).clamp(limits[0], limits[1])
-    v = (means[..., 1] / means[..., 2]).clamp(limits[2], limits[3])
+    k, most = _camera(DOUBLE).intrinsics[0], reference.STEEPEST
+    u = (means[..., 0] / means[..., 2]).clamp(-most, most)
+    v = (means[..., 1] / means[..., 2]).clamp(-most, most)
     one, nil = torch.ones_like(u), torch.zeros_like(u)
     slope = torch.stack([one, nil, -u, nil, one, -v], -1).unflatten(-1, (2, 3)) / means[..., 2, None, None]
     image = k[:2, :2] @ slope @ rotation_from_quaternion(quaternions) @ torch.diag_embed(scales)

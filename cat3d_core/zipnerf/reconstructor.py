@@ -46,6 +46,12 @@ class ZipNerf:
         field = Field.from_state(config_from_document(settings["trainer"]), tensors)
         return cls(settings, field=field.to(device).eval())
 
+    @classmethod
+    def from_state(cls, settings: Mapping[str, Any], state: Mapping[str, Tensor], device: str) -> Self:
+        """As `from_tensors`, from the `state` of a training under way."""
+        own = {name.removeprefix("field."): v for name, v in state.items() if name.startswith("field.")}
+        return cls.from_tensors(settings, own, device)
+
     @property
     def trainer(self) -> Trainer:
         """The training under way. Raises ValueError before `start`."""
