@@ -133,6 +133,18 @@ def export(
 
 
 @app.command()
+def view(
+    path: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder), or the folder of a run or sweep.")],
+    run_name: Annotated[str | None, typer.Option("--run", help="The run to begin with.")] = None,
+    port: Annotated[int, typer.Option(help="Where it is served, on 127.0.0.1.")] = 8080,
+) -> None:
+    """Look at scenes in the browser: cameras, pictures, splats, the field itself; also while they are being made."""
+    from flows.commands.view import view_command
+
+    view_command(path, run_name, port)
+
+
+@app.command()
 def models(
     describe: Annotated[str | None, typer.Option(help="Describe a size: tiny, small, paper.")] = None,
     model: Annotated[Path | None, typer.Option(help="Also show this model file.")] = None,
