@@ -119,7 +119,7 @@ def export(
     views: Annotated[int, typer.Option(help="Cameras to render for mesh, points and splats, at most.")] = 120,
     scale: Annotated[float, typer.Option(help="Their size relative to the photos.")] = 1.0,
     splats: Annotated[int, typer.Option(help="Splats, at most.")] = 200_000,
-    refine: Annotated[int, typer.Option(help="Steps in which splats learn to look like the renders.")] = 300,
+    refine: Annotated[int, typer.Option(help="Steps in which splats learn to look like the renders.")] = 500,
     path: Annotated[
         Path | None,
         typer.Option(help='Renders along it: JSON list of {"world_from_camera": 4x4, "fov": degrees}, in --frame.'),

@@ -111,7 +111,7 @@ PRESETS: dict[str, SplatConfig] = {
     ),
 }  # fmt: skip
 REFINE = replace(
-    _FAST, iterations=300, lr_means=0.001, lr_means_final=0.0001, lr_quaternions=0.005, noise=0.0, density_every=0,
+    _FAST, iterations=500, lr_means=0.001, lr_means_final=0.0001, lr_quaternions=0.005, noise=0.0, density_every=0,
     lr_log_scales=0.02, lr_harmonics=0.02, opacity_weight=0.0, scale_weight=0.0, lpips_weight=0.0,
     background=(0.5, 0.5),
 )  # fmt: skip

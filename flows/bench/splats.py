@@ -18,6 +18,7 @@ from cat3d_core.metrics.protocols import evaluate
 from cat3d_core.normalization import Similarity
 from cat3d_core.reconstruction import ReconstructionRequest, Reconstructor, Render, Views
 from cat3d_core.splats import Gaussians, rasterize_cpu, reference, render
+from cat3d_core.splats.viewpoints import between
 from cat3d_core.synthetic.families import FAMILIES
 from flows.bench.reconstruct import procedural_views
 from flows.exports.splats import splats_of, write_splats
@@ -78,7 +79,12 @@ def _pass(draw: Any, count: int, side: int, repeats: int) -> tuple[float, float]
 
 
 def conversion_rows(
-    families: Sequence[str] = tuple(FAMILIES), train: int = 24, test: int = 4, size: int = 64, steps: int = 300
+    families: Sequence[str] = tuple(FAMILIES),
+    train: int = 24,
+    test: int = 4,
+    size: int = 64,
+    steps: int = 500,
+    most_views: int = 72,
 ) -> list[dict[str, Any]]:
     """Splats against the field (preset fast) that they were made of, on held-out views, without and with refinement."""
     rows = []
@@ -86,12 +92,13 @@ def conversion_rows(
         for family in families:
             views, held, _ = procedural_views(family, train, test, size, size)
             field, seconds = trained("zipnerf", "fast", views, 0)
-            shown = [field.render(views.cameras, i) for i in range(len(views))]
+            cameras = between(views.cameras, most_views)
+            shown = [field.render(cameras, i) for i in range(len(cameras))]
             wanted = [field.render(held.cameras, i) for i in range(len(held))]
             common = {"family": family, "field_cpu_s": seconds, "field_psnr_db": _psnr(wanted, held)}
             for refinement in (0, steps):
                 started = time.process_time()
-                splats = splats_of(field, shown, views.cameras, steps=refinement)
+                splats = splats_of(field, shown, cameras, steps=refinement)
                 used = time.process_time() - started
                 images = [render(splats, held.cameras, i) for i in range(len(held))]
                 rows.append(

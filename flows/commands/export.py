@@ -10,6 +10,7 @@ import torch
 from cat3d_core.random import generator
 from cat3d_core.reconstruction import PointCloud, point_cloud, surface_depth
 from cat3d_core.splats import REFINE
+from cat3d_core.splats.viewpoints import between
 from flows.errors import InputError
 from flows.exports.dataset import write_dataset
 from flows.exports.mesh import fuse, import_open3d, without_crumbs, write_mesh_glb, write_mesh_ply
@@ -98,6 +99,8 @@ def _kinds(what: str, path_file: Path | None) -> set[str]:
 
 def _surface_exports(source: Source, kinds: set[str], out: Path, settings: SurfaceSettings) -> list[Path]:
     cameras = surface_cameras(source, settings.views)
+    if kinds == {"splats"}:
+        cameras = between(cameras, settings.views)
     renders = list(render_views(source, cameras, settings.scale))
     shown = {"min_opacity": settings.opacity, "max_depth": float("inf"), "max_radius": settings.radius}
     made = []

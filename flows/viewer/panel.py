@@ -49,7 +49,9 @@ class Panel:
             self._channel = gui.add_dropdown("Picture", CHANNELS)
             self._other = gui.add_dropdown("Compare with", (NOTHING, *self._names))
             self._split = gui.add_slider("Split", 0.0, 1.0, 0.01, 0.5)
-            self._on = {name: gui.add_checkbox(name.capitalize(), name not in ("planned",)) for name in LAYERS}
+            self._on: dict[str, Any] = {
+                name: gui.add_checkbox(name.capitalize(), name not in ("planned",)) for name in LAYERS
+            }
         renewing: list[Any] = [self._channel, self._other, self._split, self._on["reconstruction"]]
         for control in renewing:
             control.on_update(lambda _: session.moved())
@@ -93,6 +95,10 @@ class Panel:
     def shown(self, name: str) -> bool:
         """Whether a layer is to be seen."""
         return bool(self._on[name].value)
+
+    def show(self, name: str, on: bool) -> None:
+        """Show a layer or hide it."""
+        self._on[name].value = on
 
     def compared(self) -> OpenRun | None:
         """The other run, where one is to be seen beside."""

@@ -12,13 +12,14 @@ from safetensors.torch import save_file
 from cat3d_core.cameras import Cameras
 from cat3d_core.reconstruction import Reconstructor
 from cat3d_core.splats import Gaussians, Splats
+from cat3d_core.splats.viewpoints import between
 from flows.exports.splats import splats_of
 from flows.progress import meter
 from schemas.scene_store import Run, SceneStore
 
 MOST = 100_000
 """3.2 MB for the browser."""
-VIEWS, SIDE, STEPS = 32, 128, 150
+VIEWS, SIDE, STEPS = 48, 96, 200
 """Cameras that are rendered for it, the longer side of what they see, in pixels, and steps of refinement: about a
 minute of one core for a field of the preset fast."""
 VERSION = 1
@@ -48,7 +49,7 @@ def make_preview(store: SceneStore, run: Run, scene: Reconstructor, cameras: Cam
     if isinstance(scene, Splats):
         splats = splats_of(scene, [], cameras, MOST)
     else:
-        some = cameras[torch.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round().long()]
+        some = between(cameras, VIEWS)
         scales = [min(1.0, SIDE / float(size.max())) for size in some.size]
         some = Cameras.cat([some[i].resize(*_scaled(some.size[i], scale)) for i, scale in enumerate(scales)])
         some = some.to(dtype=torch.float32)

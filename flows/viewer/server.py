@@ -152,7 +152,7 @@ class Viewer:
     def _picture(self, who: int, wish: Wish, picture: Picture) -> None:
         session = self.sessions.get(who)
         if session is not None:
-            session.picture(picture)
+            session.picture(wish, picture)
 
     def _watch(self) -> None:
         """Look for what is new in the runs that someone sees, and make the splats that are missing."""

@@ -6,6 +6,7 @@ import contextlib
 import threading
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 import viser
 
@@ -38,6 +39,7 @@ class Session:
         self._layers: dict[str, Any] = {}
         self._timer: threading.Timer | None = None
         self._resting = False
+        self.shown_picture: tuple[Wish, Picture] | None = None
         self.panel = Panel(self)
         client.camera.on_update(lambda _: self.moved())
 
@@ -86,11 +88,15 @@ class Session:
 
     def shown(self) -> None:
         """Show and hide what the panel says."""
-        on = self.panel.shown
+        on, camera = self.panel.shown, self.camera()
+        here = None if camera is None else place(camera)[1]
         with self._lock:
             for group, handles in self._views.items():
                 for handle in handles:
-                    handle.visible = on(group)
+                    # One that stands in a frustum would see its picture, not the scene.
+                    inside = here is not None and float(np.linalg.norm(handle.position - here)) < FRUSTUM
+                    if handle.visible != (on(group) and not inside):
+                        handle.visible = not handle.visible
             for name, handle in self._layers.items():
                 if handle is not None:
                     handle.visible = on(name) and not (name == "splats" and self._resting)
@@ -109,9 +115,9 @@ class Session:
         self.viewer.ladder.look(self.client.client_id, None)
         with self._lock:
             if self._resting:
-                self._resting = False
+                self._resting, self.shown_picture = False, None
                 self.client.scene.set_background_image(None)
-                self.shown()
+            self.shown()
             if self._timer is not None:
                 self._timer.cancel()
             self._timer = threading.Timer(REST, self.rest)
@@ -127,7 +133,7 @@ class Session:
         wish = Wish(camera, self.panel.channel, run.scene, other.scene if other else None, self.panel.split)
         self.viewer.ladder.look(self.client.client_id, wish)
 
-    def picture(self, picture: Picture) -> None:
+    def picture(self, wish: Wish, picture: Picture) -> None:
         """Show what the ladder rendered, with its depth, so that frusta before it stay visible."""
         with self._lock:
             if not self._resting:
@@ -136,6 +142,7 @@ class Session:
             # Sharp pictures without loss; coarse ones are on their way out anyway.
             form: Any = "png" if picture.scale == 1.0 else "jpeg"
             self.client.scene.set_background_image(picture.image, form, depth=picture.depth)
+            self.shown_picture = wish, picture
 
     def fly(self, camera: Cameras) -> None:
         """Put the browser's camera at a camera (scene frame)."""

@@ -22,6 +22,7 @@ from cat3d_core.splats.rasterize import render
 from cat3d_core.splats.rasterize_cpu import available
 from cat3d_core.splats.reconstructor import Splats
 from cat3d_core.splats.trainer import SplatTrainer, expand, train
+from cat3d_core.splats.viewpoints import between
 from cat3d_core.synthetic import random_cameras, random_scene, trace
 from cat3d_core.zipnerf.coordinates import contract
 from cat3d_core.zipnerf.losses import view_weights
@@ -264,3 +265,22 @@ def test_splats_keep_the_protocol(scene: tuple[Views, Views]) -> None:
 def test_a_request_that_cannot_be_met_is_refused(preset: str, overrides: dict[str, int], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Splats.from_request(ReconstructionRequest(preset, overrides))
+
+
+def test_cameras_between_others_look_where_both_look() -> None:
+    world = random_scene("co3d", 0)
+    cameras = random_cameras(world, 0, 10, 32, 24)
+    every = between(cameras, 24)
+    assert len(every) == 24
+    assert len(between(cameras, 6)) == 6
+    assert len(between(cameras[0], 6)) == 1
+    torch.testing.assert_close(every[:10].world_from_camera, cameras.world_from_camera.double())
+    every.validate()
+    shown = []
+    for i in range(10, 24):
+        off = (every.centers[i] - 0.5 * (cameras.centers[:, None] + cameras.centers[None])).norm(dim=-1)
+        a, b = divmod(int(off.argmin()), 10)
+        assert float(off.min()) < 1e-9
+        forward = cameras.forward[a].double() + cameras.forward[b].double()
+        shown.append(float(every.forward[i] @ forward / forward.norm()))
+    assert min(shown) > 0.9, shown
