@@ -24,8 +24,7 @@
       vec2 axis = abs(xy) > 1e-6 ? normalize(vec2(xy, large - xx)) : (xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0));
       vec2 one = min(sqrt(2.0 * large), 2048.0) * axis, two = min(sqrt(2.0 * small), 2048.0) * vec2(-axis.y, axis.x);
       vec2 pixel = focal * p.xy / p.z + corner.x * one + corner.y * two;
-      uint rgba = floatBitsToUint(a.w);
-      tint = vec4(rgba & 255u, (rgba >> 8) & 255u, (rgba >> 16) & 255u, rgba >> 24) / 255.0;
+      tint = vec4(floor(c.z / 65536.0), mod(floor(c.z / 256.0), 256.0), mod(c.z, 256.0), c.w) / 255.0;
       // What the blur adds in area it takes in opacity.
       float sharp = max((image[0][0] * image[1][1] - xy * xy) / (xx * yy - xy * xy), 2.5e-5);
       tint.a *= sqrt(sharp);
@@ -69,8 +68,7 @@
   // Means, colours and covariances as a texture of 1,024 splats a row, three texels each.
   function texels(raw) {
     const count = raw.length / 32, rows = Math.max(1, Math.ceil(count / 1024));
-    const out = new Float32Array(rows * 1024 * 12), whole = new Uint32Array(out.buffer);
-    const floats = new Float32Array(raw.buffer), words = new Uint32Array(raw.buffer);
+    const out = new Float32Array(rows * 1024 * 12), floats = new Float32Array(raw.buffer);
     for (let i = 0; i < count; ++i) {
       const [w, x, y, z] = [0, 1, 2, 3].map(j => (raw[32 * i + 28 + j] - 128) / 128);
       const n = Math.hypot(w, x, y, z) || 1, [a, b, c, d] = [w / n, x / n, y / n, z / n];
@@ -80,8 +78,9 @@
       const s = [0, 1, 2].map(j => floats[8 * i + 3 + j] ** 2), at = 12 * i;
       const cov = (p, q) => s[0] * R[3 * p] * R[3 * q] + s[1] * R[3 * p + 1] * R[3 * q + 1] + s[2] * R[3 * p + 2] * R[3 * q + 2];
       out.set(floats.subarray(8 * i, 8 * i + 3), at);
-      whole[at + 3] = words[8 * i + 6];
-      out.set([cov(0, 0), cov(0, 1), cov(0, 2), cov(1, 1), cov(1, 2), cov(2, 2)], at + 4);
+      const [red, green, blue, alpha] = raw.subarray(32 * i + 24, 32 * i + 28);
+      const colour = 65536 * red + 256 * green + blue;  // whole numbers up to 2^24 are exact
+      out.set([cov(0, 0), cov(0, 1), cov(0, 2), cov(1, 1), cov(1, 2), cov(2, 2), colour, alpha], at + 4);
     }
     return {count, rows, out, floats};
   }
@@ -253,7 +252,10 @@
         far = Math.max(far, d);
       }
       const scale = 65535 / Math.max(far - near, 1e-9), begins = new Uint32Array(65537), keys = new Uint16Array(count);
-      for (let i = 0; i < count; ++i) ++begins[(keys[i] = (far - depth[i]) * scale) + 1];
+      for (let i = 0; i < count; ++i) {
+        keys[i] = (far - depth[i]) * scale;
+        ++begins[keys[i] + 1];
+      }
       for (let i = 0; i < 65536; ++i) begins[i + 1] += begins[i];
       const order = new Uint32Array(count);
       for (let i = 0; i < count; ++i) order[begins[keys[i]]++] = i;
