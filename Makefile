@@ -4,6 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 DEMO_OUT ?= outputs/demo
 DEMO_ARGS ?=
+FIGURE_ARGS ?=
 
 .PHONY: demo test test-slow lint docs figures setup clean
 
@@ -26,15 +27,17 @@ test-slow: setup
 lint: setup
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
 
-# Reference pages from the code, then the site; a warning fails.
+# Reference pages from the code, then the site; a warning fails. The variable hides a notice about MkDocs 2.
 docs: setup
 	$(BIN)/python -m infra.docs.reference
-	$(BIN)/mkdocs build --quiet --strict --config-file infra/docs/mkdocs.yml
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --config-file infra/docs/mkdocs.yml
 	@echo "Site: outputs/site/index.html"
 
-# Every picture and table of the documents, from what benchmarks and sweeps left in docs/benchmarks and docs/figures.
+# Every picture of the documents: the scene of the README is made first (once), charts come from tables in docs/.
+# README's table of quality comes from a sweep: make figures FIGURE_ARGS="--sweep outputs/sweep"
 figures: setup
-	$(BIN)/python -m infra.docs.figures
+	$(BIN)/cat3d sweep infra/docs/showcase.yaml --out outputs/showcase
+	$(BIN)/python -m infra.docs.figures --showcase outputs/showcase $(FIGURE_ARGS)
 
 clean:
 	rm -rf $(VENV) outputs build *.egg-info

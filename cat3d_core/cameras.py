@@ -1,4 +1,4 @@
-"""Batches of pinhole cameras and the one similarity that normalises a scene.
+"""Batches of pinhole cameras. (The similarity that normalises a scene is in normalization.py.)
 
 Conventions, stated once: OpenCV camera axes (x right, y down, z forward); `world_from_camera` maps camera to world
 points; `intrinsics` in pixels; the centre of the pixel in column i, row j is (i + 0.5, j + 0.5).

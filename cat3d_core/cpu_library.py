@@ -27,7 +27,8 @@ def _processor() -> str:
 
 
 def _compile(name: str) -> Path:
-    """Path of the shared library of the core's NAME.cpp for this processor, compiled where the cache lacks it."""
+    """Path of the shared library of this package's NAME.cpp (such as zipnerf/hash_grid) for this processor, compiled
+    where the cache lacks it."""
     source = Path(__file__).parent / f"{name}.cpp"
     compiler = os.environ.get("CXX", "g++")
     key = hashlib.sha256(source.read_bytes() + repr((compiler, _FLAGS, _processor())).encode()).hexdigest()[:24]

@@ -5,7 +5,8 @@ Made once per scene from the captured cameras, stored and printed before anythin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -14,12 +15,11 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.coverage import Coverage, coverage, direction_bins, gains, seen_from_nearby, voxel_grid
 from cat3d_core.sample_sets import KINDS, kept_window, sample_cameras
 from cat3d_core.trajectories import RECIPES, FreeSpace, SceneFrame, build_trajectory, choose_recipe, scene_frame
-from cat3d_core.view_selection import NO_VIEW, consecutive_groups, farthest_points, nearest_views, pad_group
+from cat3d_core.view_selection import NO_VIEW, consecutive_groups, farthest_points, nearest_views
 
 SQUARE, WIDE = range(2)
 #: A captured view this close in direction shows a place as a generated one would.
 COVERED_DEG = 15.0
-_VIEWS_PER_PASS = 8  # conditioning + target views the model was trained for
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,10 @@ class PlanConfig:
     """What to plan. None means: as the paper does for this number of captured views.
 
     trajectory: 'auto' or a name in RECIPES. count: generated views per sample kind (the recipe's by default).
-    scales, sides, heights, forwards: replace the recipe's (units of the scene's distance). anchors: 7 for one captured
-    view, else 0. conditions: M, conditioning views per group (3). group_size: target views per group (8 - M); anchors
-    of a single image are made in groups of 7 on that image alone. keep_captured: captured views take conditioning
+    views: conditioning and target views that the generator takes at once (paper: 8). scales, sides, heights, forwards:
+    replace the recipe's (units of the scene's distance). anchors: 7 for one captured view, else 0. conditions: M,
+    conditioning views per group (3). group_size: target views per group (views - M); anchors of a single image are
+    made in groups of views - 1 on that image alone. keep_captured: captured views take conditioning
     slots before anchors do. samples: 'square', 'wide' or 'both' ('both' generates every view twice). image_size: side
     of a sample in pixels. pitch_down_deg: how far a single captured camera looks down (several show it themselves).
     drop_by_coverage: leave out views that add nothing to the coverage. covered_share: plan that nothing be generated
@@ -38,6 +39,7 @@ class PlanConfig:
     """
 
     trajectory: str = "auto"
+    views: int = 8
     count: int | None = None
     scales: tuple[float, ...] | None = None
     sides: tuple[float, ...] | None = None
@@ -61,7 +63,7 @@ class PlanConfig:
             )
         if self.samples not in (*KINDS, "both"):
             raise ValueError(f"There is no sample set {self.samples!r}; use 'square', 'wide' or 'both'.")
-        least = {"count": 1, "anchors": 0, "conditions": 1, "group_size": 1, "image_size": 1}
+        least = {"views": 2, "count": 1, "anchors": 0, "conditions": 1, "group_size": 1, "image_size": 1}
         for name, minimum in least.items():
             value = getattr(self, name)
             if value is not None and value < minimum:
@@ -69,35 +71,35 @@ class PlanConfig:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """N views to generate, in G groups of at most S targets.
+class Group:
+    """Views sampled together: targets (n), planned views in order, given conditions (m), below V a captured view, V + j
+    the planned view j (an anchor). kind: the sample set, "square" or "wide". anchors: whether the targets are anchors.
+    """
 
-    cameras: N sample cameras, square, float64. path (N,): index of the path. pose (N,): index of the trajectory pose
-    (equal for the square and the wide sample of one pose). group (N,), order_in_group (N,). anchor (N,) bool.
-    condition (N, M): what the view is conditioned on: -1 nothing, 0..V-1 a captured view, V + j generated view j (an
-    anchor); all views of a group have the same row. group_views (G, S): views of each group in order, short groups
-    filled by repeats; -1 beyond group_targets (G,), the number of targets the network gets. group_valid (G, S) bool:
-    False for repeats, whose outputs are dropped. sample_kind (N,): 0 square, 1 wide. window (N, 4): [x0, y0, width,
-    height] of the sample to keep. recipe: name. reasons: why, in sentences. frame: the scene as the plan saw it.
-    captured_count: V. captured_coverage, plan_coverage: before and after (captured and planned views together).
-    needed: False where captured views cover the path already (`PlanConfig.covered_share`): sample nothing.
+    targets: tuple[int, ...]
+    conditions: tuple[int, ...]
+    kind: str
+    anchors: bool = False
+
+
+@dataclass(frozen=True)
+class Plan:
+    """N views to generate, in groups.
+
+    cameras: N sample cameras, square, float64. path (N,): index of the path. window (N, 4): [x0, y0, width, height] of
+    the sample to keep. groups: each view is a target of one. recipe: name. reasons: why, in sentences. frame: the scene
+    as the plan saw it (None where an older program stored the plan). captured_count: V. captured_coverage,
+    plan_coverage: before and after (captured and planned views together). needed: False where captured views cover the
+    path already (`PlanConfig.covered_share`): sample nothing.
     """
 
     cameras: Cameras
     path: Tensor
-    pose: Tensor
-    group: Tensor
-    order_in_group: Tensor
-    anchor: Tensor
-    condition: Tensor
-    group_views: Tensor
-    group_valid: Tensor
-    group_targets: Tensor
-    sample_kind: Tensor
     window: Tensor
+    groups: tuple[Group, ...]
     recipe: str
     reasons: list[str]
-    frame: SceneFrame
+    frame: SceneFrame | None
     captured_count: int
     captured_coverage: Coverage
     plan_coverage: Coverage
@@ -107,10 +109,53 @@ class Plan:
         return len(self.cameras)
 
     def passes(self) -> list[list[int]]:
-        """Groups that can be sampled at the same time, in order: anchor groups first, then the rest."""
-        is_anchor = [bool(self.anchor[v]) for v in self.group_views[:, 0].tolist()]
-        first = [g for g, a in enumerate(is_anchor) if a]
-        return [p for p in (first, [g for g, a in enumerate(is_anchor) if not a]) if p]
+        """Numbers of the groups that can be sampled at the same time, in order: those of anchors, then the others; none
+        where nothing need be generated."""
+        if not self.needed:
+            return []
+        first = [g for g, group in enumerate(self.groups) if group.anchors]
+        return [p for p in (first, [g for g, group in enumerate(self.groups) if not group.anchors]) if p]
+
+    def among(self, views: Sequence[int], count: int) -> Plan:
+        """The same plan where its captured view i is number views[i] of `count` captured views."""
+
+        def number(view: int) -> int:
+            return views[view] if view < self.captured_count else view + count - self.captured_count
+
+        groups = (replace(group, conditions=tuple(map(number, group.conditions))) for group in self.groups)
+        return replace(self, groups=tuple(groups), captured_count=count)
+
+    @property
+    def group_views(self) -> Tensor:
+        """(G, S) targets of each group, NO_VIEW beyond them."""
+        return _rows([group.targets for group in self.groups])
+
+    @property
+    def condition(self) -> Tensor:
+        """(N, M) conditions of each view's group, NO_VIEW beyond them."""
+        return _rows([group.conditions for group in self._by_view()])
+
+    @property
+    def anchor(self) -> Tensor:
+        """(N,) bool."""
+        return torch.tensor([group.anchors for group in self._by_view()])
+
+    @property
+    def sample_kind(self) -> Tensor:
+        """(N,) number of each view's sample set: SQUARE or WIDE."""
+        return torch.tensor([KINDS.index(group.kind) for group in self._by_view()])
+
+    def _by_view(self) -> list[Group]:
+        groups = {view: group for group in self.groups for view in group.targets}
+        return [groups[view] for view in range(len(self))]
+
+
+def _rows(rows: Sequence[Sequence[int]]) -> Tensor:
+    """(R, longest) int64, NO_VIEW where a row is shorter."""
+    out = torch.full((len(rows), max(map(len, rows))), NO_VIEW, dtype=torch.long)
+    for row, values in zip(out, rows, strict=True):
+        row[: len(values)] = torch.tensor(values)
+    return out
 
 
 def make_plan(
@@ -173,10 +218,17 @@ def make_plan(
             )
             poses, path, after = poses[useful], path[useful], after[useful]
 
-    parts = [_group(captured, poses, path, kind, config, frame) for kind in kinds]
-    merged = _merge(parts, len(captured))
+    samples = [_with_poses(captured, poses, kind, config.image_size) for kind in kinds]
+    groups: list[Group] = []
+    for number, (kind, cameras) in enumerate(zip(kinds, samples, strict=True)):
+        groups += _groups(captured, cameras, path, kind, config, frame, first=number * len(poses))
+    size = captured.size.median(0).values[None]
+    windows = [kept_window(size, kind, config.image_size).expand(len(poses), 4) for kind in kinds]
     return Plan(
-        **merged,
+        cameras=Cameras.cat(samples),
+        path=path.repeat(len(kinds)),
+        window=torch.cat(windows),
+        groups=tuple(groups),
         recipe=name,
         reasons=reasons,
         frame=frame,
@@ -194,80 +246,41 @@ def _with_poses(captured: Cameras, poses: Tensor, kind: str, image_size: int) ->
     return Cameras(intrinsics.expand(len(poses), 3, 3).clone(), poses, samples.size[:1].expand(len(poses), 2).clone())
 
 
-def _group(captured: Cameras, poses: Tensor, path: Tensor, kind: str, config: PlanConfig, frame: SceneFrame) -> dict:
-    """Anchors, groups and conditions of one sample kind."""
-    cameras = _with_poses(captured, poses, kind, config.image_size)
+def _groups(
+    captured: Cameras, cameras: Cameras, path: Tensor, kind: str, config: PlanConfig, frame: SceneFrame, first: int
+) -> list[Group]:
+    """Anchors, groups and conditions of one sample kind, whose views are numbered from `first` on."""
     single = len(captured) == 1
-    slots = config.conditions or 3
-    size = config.group_size or max(1, _VIEWS_PER_PASS - slots)
+    slots = config.conditions or min(3, config.views - 1)
+    size = config.group_size or max(1, config.views - slots)
     wanted = config.anchors if config.anchors is not None else (7 if single else 0)
     anchors = farthest_points(cameras, min(wanted, len(cameras)), frame.distance, given=captured)
     # A single image makes its anchors in one pass of 1 + 7; several images make theirs like any group.
-    anchor_size = _VIEWS_PER_PASS - 1 if single and config.group_size is None else size
+    anchor_size = config.views - 1 if single and config.group_size is None else size
     others = sorted(set(range(len(cameras))) - set(anchors))
-    runs = [others[i:j] for i, j in _runs(path[others].tolist())]
-    groups = [(g, anchor_size, True) for g in consecutive_groups(anchors, anchor_size)]
-    groups += [(g, size, False) for run in runs for g in consecutive_groups(run, size)]
+    members = [(g, True) for g in consecutive_groups(anchors, anchor_size)]
+    for begin, end in _runs(path[others].tolist()):
+        members += [(g, False) for g in consecutive_groups(others[begin:end], size)]
 
-    width = max(n for _, n, _ in groups)
-    views = torch.full((len(groups), width), NO_VIEW, dtype=torch.long)
-    valid = torch.zeros(len(groups), width, dtype=torch.bool)
-    group, order = torch.zeros(2, len(cameras), dtype=torch.long)
-    condition = torch.full((len(cameras), slots), NO_VIEW, dtype=torch.long)
     sources = Cameras.cat([captured, cameras[anchors]])
-    names = list(range(len(captured))) + [len(captured) + a for a in anchors]
+    names = [*range(len(captured)), *(len(captured) + first + anchor for anchor in anchors)]
     # One captured view is always kept (paper: 'given the observed and anchor views').
-    first = len(captured) if config.keep_captured or single else 0
-    for number, (members, targets, of_anchors) in enumerate(groups):
-        padded, kept = pad_group(members, targets)
-        views[number, :targets], valid[number, :targets] = torch.tensor(padded), torch.tensor(kept)
-        group[members], order[members] = number, torch.arange(len(members))
-        near = cameras[members]
+    kept = len(captured) if config.keep_captured or single else 0
+    groups = []
+    for views, of_anchors in members:
+        near = cameras[views]
         if of_anchors and single:
             row = [0]
         elif of_anchors:
             row = nearest_views(near, captured, slots, frame.distance, repeat=config.repeat_conditions)
         else:
-            row = nearest_views(near, sources, slots, frame.distance, first, config.repeat_conditions)
-            row = [names[i] if i != NO_VIEW else NO_VIEW for i in row]
-        condition[members, : len(row)] = torch.tensor(row)
-    is_anchor = torch.zeros(len(cameras), dtype=torch.bool)
-    is_anchor[anchors] = True
-    median_size = captured.size.median(0).values[None]
-    return {
-        "cameras": cameras,
-        "path": path,
-        "pose": torch.arange(len(cameras)),
-        "group": group,
-        "order_in_group": order,
-        "anchor": is_anchor,
-        "condition": condition,
-        "group_views": views,
-        "group_valid": valid,
-        "group_targets": torch.tensor([n for _, n, _ in groups]),
-        "sample_kind": torch.full((len(cameras),), KINDS.index(kind)),
-        "window": kept_window(median_size, kind, config.image_size).expand(len(cameras), 4).clone(),
-    }
+            row = nearest_views(near, sources, slots, frame.distance, kept, config.repeat_conditions)
+        conditions = tuple(names[i] for i in row if i != NO_VIEW)
+        groups.append(Group(tuple(first + v for v in views), conditions, kind, of_anchors))
+    return groups
 
 
 def _runs(path: list[int]) -> list[tuple[int, int]]:
     """Half-open ranges of equal path numbers: a group never spans two paths."""
     edges = [0] + [i for i in range(1, len(path)) if path[i] != path[i - 1]] + [len(path)]
     return [(a, b) for a, b in zip(edges, edges[1:], strict=False) if b > a]
-
-
-def _merge(parts: list[dict], captured_count: int) -> dict:
-    """The sample kinds' parts one after another, with view and group numbers moved on."""
-    if len(parts) == 1:
-        return parts[0]
-    first, second = parts
-    n, g = len(first["cameras"]), len(first["group_views"])
-    second = dict(second)
-    second["group"] = second["group"] + g
-    second["group_views"] = torch.where(second["group_views"] >= 0, second["group_views"] + n, NO_VIEW)
-    second["condition"] = torch.where(
-        second["condition"] >= captured_count, second["condition"] + n, second["condition"]
-    )
-    return {
-        k: Cameras.cat([first[k], second[k]]) if k == "cameras" else torch.cat([first[k], second[k]]) for k in first
-    }

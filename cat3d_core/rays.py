@@ -50,6 +50,34 @@ def image_rays(cameras: Cameras, view: int, width: int | None = None, height: in
     return pixel_rays(camera, torch.zeros(len(xy), dtype=torch.long, device=xy.device), xy)
 
 
+def reference_from_image(cameras: Cameras, reference: Tensor) -> Tensor:
+    """(N, 4, 4) float64: each camera as one matrix, seen from the pose `reference` (4, 4).
+
+    It takes (u d, v d, d, 1), with the z-depth d and u, v in [-1, 1] from edge to edge of the image, to the point
+    (x, y, z, 1) in the frame of the reference. It says all that a pinhole camera is, whatever the image's size.
+    """
+    cams, pose = cameras.to(dtype=torch.float64), reference.double()
+    image_from_square = torch.diag_embed(torch.nn.functional.pad(cams.size.double() / 2, (0, 1), value=1.0))
+    image_from_square[:, :2, 2] = cams.size.double() / 2
+    to_reference = pose[:3, :3].T
+    out = torch.zeros_like(cams.world_from_camera)
+    out[:, :3, :3] = to_reference @ cams.rotation @ _inverse_intrinsics(cams.intrinsics) @ image_from_square
+    out[:, :3, 3] = (cams.centers - pose[:3, 3]) @ to_reference.T
+    out[:, 3, 3] = 1
+    return out
+
+
+def matrix_rays(matrices: Tensor, height: int, width: int) -> Tensor:
+    """(..., 6, height, width): origin and unit direction of the ray through the centre of each cell of views given as
+    `reference_from_image` (..., 4, 4). A matrix of zeros gives rays of zeros."""
+    y, x = ((torch.arange(n, dtype=matrices.dtype, device=matrices.device) * 2 + 1 - n) / n for n in (height, width))
+    across, down, middle, origin = matrices[..., :3, :, None, None].unbind(-3)
+    directions = across * x + down * y[:, None] + middle
+    tiny = torch.finfo(matrices.dtype).tiny
+    directions = directions / directions.norm(dim=-3, keepdim=True).clamp_min(tiny)
+    return torch.cat([origin.expand_as(directions), directions], -3)
+
+
 def raymap(cameras: Cameras, relative_to: Tensor, height: int, width: int, plucker: bool = False) -> Tensor:
     """(N, 6, height, width) ray of the centre of each latent cell, in the frame of the pose `relative_to` (4, 4).
 
@@ -59,19 +87,10 @@ def raymap(cameras: Cameras, relative_to: Tensor, height: int, width: int, pluck
     to the first conditioning camera, the map does not change under rigid motions of the world (paper, 'Camera
     conditioning'). Computed in float64, returned in the cameras' dtype.
     """
-    dtype = cameras.intrinsics.dtype
-    cams = cameras.to(dtype=torch.float64).resize(width, height)
-    reference = relative_to.double()
-    to_reference = reference[:3, :3].T
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    grid = torch.stack([x, y, torch.ones_like(x)]).double().reshape(3, -1).to(reference.device)
-    directions = to_reference @ cams.rotation @ _inverse_intrinsics(cams.intrinsics) @ grid
-    directions = directions / directions.norm(dim=1, keepdim=True)
-    origins = (cams.centers - reference[:3, 3]) @ to_reference.T
-    first = origins[:, :, None].expand_as(directions)
+    rays = matrix_rays(reference_from_image(cameras, relative_to), height, width)
     if plucker:
-        first = torch.linalg.cross(first, directions, dim=1)
-    return torch.cat([first, directions], 1).reshape(len(cams), 6, height, width).to(dtype)
+        rays = torch.cat([torch.linalg.cross(rays[:, :3], rays[:, 3:], dim=1), rays[:, 3:]], 1)
+    return rays.to(cameras.intrinsics.dtype)
 
 
 def _inverse_intrinsics(k: Tensor) -> Tensor:

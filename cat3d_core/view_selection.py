@@ -24,6 +24,13 @@ def pose_distance(a: Cameras, b: Cameras, scale: float, direction_weight: float 
     return torch.hypot(shift, direction_weight * turn)
 
 
+def camera_distance(cameras: Cameras) -> Tensor:
+    """(N, N) distance between centres plus angle between viewing directions (radians): what the nearest view is that
+    samples are compared with."""
+    cosine = (cameras.forward @ cameras.forward.T).clamp(-1, 1)
+    return torch.cdist(cameras.centers, cameras.centers) + torch.acos(cosine)
+
+
 def farthest_points(
     cameras: Cameras, count: int, scale: float = 1.0, given: Cameras | None = None, direction_weight: float = 0.0
 ) -> list[int]:
@@ -63,18 +70,6 @@ def consecutive_groups(views: list[int], size: int) -> list[list[int]]:
     if size < 1:
         raise ValueError(f"A group needs at least one view; the group size is {size}.")
     return [views[i : i + size] for i in range(0, len(views), size)]
-
-
-def pad_group(views: list[int], size: int) -> tuple[list[int], list[bool]]:
-    """A group repeated up to `size` views, and which of them are kept.
-
-    The network is trained for one number of targets (its noise schedule is shifted by the log of it), so a short
-    group is filled by repeating its last view; the repeats' outputs are dropped.
-    """
-    if not 0 < len(views) <= size:
-        raise ValueError(f"A group of {len(views)} views cannot be padded to {size}.")
-    missing = size - len(views)
-    return views + [views[-1]] * missing, [True] * len(views) + [False] * missing
 
 
 def nearest_views(

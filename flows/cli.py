@@ -91,13 +91,15 @@ def plan(
 @app.command()
 def inspect(
     store: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder).")],
+    array: Annotated[str | None, typer.Argument(help="One of its arrays, such as captured/image.")] = None,
+    png: Annotated[Path | None, typer.Option(help="Draw that array (images, depth, latents) or runs/RUN/plan.")] = None,
     verify: Annotated[bool, typer.Option("--verify", help="Read every chunk and check it.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
 ) -> None:
-    """What a store holds: arrays, stages done, cameras, what is stale."""
+    """What a store holds: arrays, stages done, cameras, what is stale; or one array with its statistics."""
     from flows.commands.inspect import inspect_command
 
-    inspect_command(store, verify, as_json)
+    inspect_command(store, array, verify, as_json, png)
 
 
 @app.command()
@@ -229,6 +231,22 @@ def train(
     given: dict[str, Any] = {"steps": steps, "minutes": minutes, "seed": seed, "device": device}
     given |= {"start": str(start) if start else None} | ({"autoencoder": {"path": path}} if path else {})
     train_command(config, out, given, set_ or [], list_, bank_only)
+
+
+@app.command()
+def worlds(
+    package: Annotated[Path, typer.Argument(help="Folder for Debian's supertuxkart-data; fetched if not there yet.")],
+    held_out: Annotated[
+        Path | None, typer.Option(help="Photograph the held-out tracks into this folder, to evaluate models on.")
+    ] = None,
+    groups: Annotated[int, typer.Option(help="How many held-out groups of cameras, at least.")] = 60,
+    views: Annotated[int, typer.Option(help="Cameras of a held-out group.")] = 10,
+    size: Annotated[int, typer.Option(help="Side of their pictures in pixels.")] = 128,
+) -> None:
+    """Fetch textured worlds to train on (628 MB, nothing is installed), and list their licences."""
+    from flows.commands.worlds import worlds_command
+
+    worlds_command(package, held_out, groups, views, size)
 
 
 @app.command()

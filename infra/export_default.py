@@ -18,9 +18,10 @@ from typing import Any
 import torch
 
 from cat3d_core.diffusion import MultiViewModel, describe, load_model, save_model
+from cat3d_core.generation.advice import FEW_STEPS
 from cat3d_core.metrics.perceptual import find_perceptual
-from flows.bench.model import evaluate_file
 from flows.training.autoencoder import reconstruction_psnr, train_autoencoder
+from flows.training.evaluation import evaluate_file
 from flows.training.prepare import read_photos
 from flows.training.renders import rendered_images
 
@@ -29,7 +30,8 @@ WEIGHTS, CARD = ROOT / "cat3d_core" / "weights" / "default.safetensors", ROOT / 
 START, END = "<!-- numbers: written by infra/export_default.py -->", "<!-- end of numbers -->"
 HELD_OUT_PHOTOS = 6  # for the autoencoder's test
 # What a briefly trained model is at its best with (docs/explanation/model_card.md); runs take it from the file.
-SAMPLER = {"solver": "ddim", "nodes": "trailing", "steps": 4, "guidance": 1.0}
+SAMPLER = {name: getattr(FEW_STEPS, name) for name in ("solver", "nodes", "steps")}
+SAMPLER["guidance"] = FEW_STEPS.guidance.scale
 
 
 def refine(model: MultiViewModel, training: dict[str, Any], work: Path, minutes: float) -> dict[str, Any]:

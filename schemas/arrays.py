@@ -100,7 +100,7 @@ def open_array(folder: Path, writable: bool) -> zarr.Array:
         raise MissingError(f"{folder} does not exist.") from None
     except (ValueError, KeyError, TypeError) as error:
         raise StoreError(f"{folder / 'zarr.json'} is damaged: {error}") from error
-    return array.with_config({"write_empty_chunks": True})  # isn't stored with the array, so it is said again
+    return array.with_config({"write_empty_chunks": True})  # not stored with the array, so set at every opening
 
 
 def chunk_coordinates(array: zarr.Array) -> Iterable[tuple[int, ...]]:

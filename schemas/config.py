@@ -22,6 +22,7 @@ from pydantic import (
 )
 
 from schemas.errors import ConfigError
+from schemas.hints import HintsConfig
 from schemas.settings import spelled_out
 from schemas.skip import SkipConfig
 from schemas.strict import StrictModel as _Model
@@ -87,8 +88,11 @@ class SampleConfig(_Model):
     after few steps without guidance), else the point on the measured front: unipc, log_snr, 10 steps, guidance 3.
     """
 
+    generator: str | None = None
+    """Which generator: "cat3d" or the name of an installed package's (docs/guides/own_generator.md); None: the one that
+    recognises the checkpoint."""
     checkpoint: Path | None = None
-    """Weights of the model; None: the ones shipped."""
+    """File or folder with the generator's weights; None: the ones shipped."""
     solver: str | None = None
     """Solver of the probability-flow ODE (paper: ddim): ddim, dpm++, unipc, or a further one of the core's SOLVERS."""
     nodes: Literal["trailing", "linspace", "log_snr", "karras"] | None = None
@@ -179,6 +183,7 @@ class RunConfig(_Model):
     ingest: IngestConfig = Field(default_factory=IngestConfig)
     poses: PosesConfig = Field(default_factory=PosesConfig)
     plan: PlanConfig = Field(default_factory=PlanConfig)
+    hints: HintsConfig = Field(default_factory=HintsConfig)
     sample: SampleConfig = Field(default_factory=SampleConfig)
     reconstruct: ReconstructConfig = Field(default_factory=ReconstructConfig)
     render: RenderConfig = Field(default_factory=RenderConfig)

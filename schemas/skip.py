@@ -20,6 +20,8 @@ class SkipConfig(StrictModel):
     """Plan: views that add nothing to the coverage of the scene."""
     covered_path: bool = True
     """Plan: all generated views, where captured views see what the path sees from nearly the same directions."""
+    explained: bool = True
+    """Sample: groups whose views the photos show in every place (see `hints`); they are what the photos show."""
     rounds: bool = False
     """Sample: groups are sampled in rounds, each where a briefly trained field knows least, as long as a round lowers
     its error in a held-out captured view."""

@@ -42,6 +42,11 @@ class SceneBankConfig(_Model):
     """Cameras of a scene; a group is drawn from them."""
     variants: Annotated[int, Field(ge=1, le=3)] = 3
     """1: as rendered; 2: also recoloured and mirrored; 3: also recoloured."""
+    worlds: Path | None = None
+    """Folder into which Debian's supertuxkart-data was unpacked (`cat3d worlds`): textured worlds beside the
+    procedural scenes, each of their five kinds of camera paths a family of its own."""
+    world_groups: PositiveInt = 600
+    """Captures of these worlds, if there are any."""
     textures: Path | None = None
     """Folder of photographs (.jpg) to cut textures from, beside the procedural ones."""
     folder: Path | None = None

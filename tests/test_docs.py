@@ -9,8 +9,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "infra").rglob("*.md")])
-#: Lines that may be longer than 100 characters: tables, code, links alone, and what a program wrote.
-LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)|<img[^>]*src=\"([^\"]+)\"")
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)|<img[^>]*src=\"([^\"]+)\"|^\[[^\]]+\]: (\S+)$", re.M)
+#: Written by a program from measurements, or a record of the past: their lines may be long.
+FREE = {ROOT / "docs/reference/benchmarks.md", *(ROOT / "docs/log").glob("*.md")}
+LONGEST, README_LINES, PICTURE_BYTES = 100, 120, 300_000
 
 
 def anchors(page: Path) -> set[str]:
@@ -23,7 +25,7 @@ def anchors(page: Path) -> set[str]:
 def test_links_and_figures_lead_somewhere(page: Path) -> None:
     missing = []
     for match in LINK.finditer(page.read_text()):
-        target = match.group(1) or match.group(2)
+        target = next(filter(None, match.groups()))
         if re.match(r"[a-z]+:", target):
             continue  # an address in the net: not asked here
         path, _, anchor = target.partition("#")
@@ -48,3 +50,30 @@ def test_generated_pages_are_what_the_code_says() -> None:
     from infra.docs.reference import stale
 
     assert not stale(), f"Write them with `make docs`: {stale()}"
+
+
+def prose(page: Path) -> list[str]:
+    """Lines of a page outside of code blocks, tables and comments, which hold what programs wrote."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.M | re.S)
+    return [line for line in text.splitlines() if not line.startswith(("    ", "|", "<!--"))]
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p not in FREE], ids=lambda p: str(p.relative_to(ROOT)))
+def test_lines_of_prose_are_short(page: Path) -> None:
+    long = [line for line in prose(page) if len(line) > LONGEST]
+    assert not long, f"{page.relative_to(ROOT)} has lines of over {LONGEST} characters: {long}"
+
+
+def test_readme_is_short_and_shows_pictures() -> None:
+    readme = ROOT / "README.md"
+    lines = readme.read_text().splitlines()
+    assert len(lines) <= README_LINES
+    assert all(len(line) <= LONGEST for line in lines)
+    paragraphs = "\n".join(prose(readme)).split("\n\n")
+    assert all(len(p.splitlines()) <= 4 for p in paragraphs if not p.startswith(("- ", "[")))
+    text = re.sub(r"\]\([^)]*\)|`[^`]*`|^\[[^\]]+\]: .*$|<!--.*", "", "\n".join(prose(readme)), flags=re.M)
+    assert len(re.findall(r"(?<![\w-])\d[\d.,]*", text)) < 15, "numbers in README's prose"
+    pictures = {ROOT / p for p in re.findall(r"docs/figures/[\w.]+", readme.read_text())}
+    assert len(pictures) >= 5
+    assert all(picture.stat().st_size < PICTURE_BYTES for picture in pictures)
+    assert not re.findall(r"!\[\]", readme.read_text()), "every picture has alternative text"

@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.diffusion.conditioning import relative_raymaps
 from cat3d_core.random import generator
-from cat3d_core.rays import raymap
+from cat3d_core.rays import reference_from_image
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class LatentBank:
         return self.latents.shape[0]
 
     def batch(self, groups: int, views: int, seed: int, *key: str | int, spread: float = 1.0) -> tuple[Tensor, Tensor]:
-        """Draw latents [groups, views, C, h, w] and raymaps [groups, views, 6, h, w] relative to view 0, on the CPU.
+        """Draw latents [groups, views, C, h, w] and cameras [groups, views, 4, 4] seen from view 0, on the CPU.
 
         Every family is equally likely (paper, appendix A), then every scene of it. A group is a random view and others
         from the nearest `spread` (0..1] of its scene's cameras, in random order. The draw depends on the key alone.
@@ -65,14 +64,13 @@ class LatentBank:
         near = apart.argsort(1)[:, :pool]
         picked = near.gather(1, torch.rand(groups, pool, generator=random).argsort(1)[:, :views])
         rows = scene[:, None].expand_as(picked)
-        return self.latents[rows, picked], self.raymaps(rows, picked)
+        return self.latents[rows, picked], self.cameras(rows, picked)
 
-    def raymaps(self, scene: Tensor, view: Tensor) -> Tensor:
-        """[G, V, 6, h, w] float32 for scene and view indices [G, V], relative to the first view of each group."""
+    def cameras(self, scene: Tensor, view: Tensor) -> Tensor:
+        """[G, V, 4, 4] float64 for scene and view indices [G, V]: `rays.reference_from_image`, with the first view of
+        each group as the reference."""
         poses = self.world_from_camera[scene, view].double()
         intrinsics = self.intrinsics[scene, view].double()
-        size = torch.full((scene.numel(), 2), self.image_size, dtype=torch.int64)
-        cameras = Cameras(intrinsics.flatten(0, 1), poses.flatten(0, 1), size)
-        height, width = self.latents.shape[-2:]
-        world = raymap(cameras, torch.eye(4, dtype=torch.float64), height, width)
-        return relative_raymaps(world.unflatten(0, scene.shape), poses[:, 0]).float()
+        size = torch.full((*scene.shape, 2), self.image_size, dtype=torch.int64)
+        groups = zip(intrinsics, poses, size, strict=True)
+        return torch.stack([reference_from_image(Cameras(*group), group[1][0]) for group in groups])

@@ -2,31 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from cat3d_core.diffusion.autoencoder import ENCODER
 from cat3d_core.diffusion.config import ModelConfig
 from cat3d_core.diffusion.model import MultiViewModel
+from cat3d_core.weights_file import exported, read_weights, weights_hash, write_weights
 
 FORMAT = "cat3d.multiview.1"
-
-
-def weights_hash(state: dict[str, Tensor]) -> str:
-    """SHA-256 over names, dtypes, shapes and bytes, in the order of names: the same for equal weights in any file."""
-    digest = hashlib.sha256()
-    for name in sorted(state):
-        tensor = state[name].detach().cpu().contiguous()
-        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
-        digest.update(tensor.flatten().view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()
 
 
 def save_model(
@@ -37,14 +25,7 @@ def save_model(
     dtype: convert floating-point weights (torch.float16 to ship). Returns the weights' hash, which is also in the file.
     The file appears under its name only when it is complete.
     """
-    state = {
-        name: (t.to(dtype) if dtype and t.is_floating_point() else t).detach().cpu().contiguous().clone()
-        for name, t in model.state_dict().items()
-    }
-    if not all(torch.isfinite(t).all() for t in state.values()):
-        raise ValueError(
-            f"The weights to be saved in {path} have values that are not finite (in {dtype or 'their dtype'})."
-        )
+    state = exported(model.state_dict(), dtype, Path(path))
     digest = weights_hash(state)
     encoder = tuple(f"autoencoder.{name}" for name in ENCODER)
     metadata = {
@@ -54,7 +35,7 @@ def save_model(
         "sha256": digest,
         "encoder_sha256": weights_hash({name: t for name, t in state.items() if name.startswith(encoder)}),
     }
-    _write(Path(path), state, metadata)
+    write_weights(Path(path), state, metadata)
     return digest
 
 
@@ -65,7 +46,7 @@ def load_model(
 
     Raises ValueError if the file is not such a checkpoint, is damaged, or lacks weights; FileNotFoundError if absent.
     """
-    metadata, state = _read(Path(path))
+    metadata, state = read_weights(Path(path))
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path} is no cat3d model: its format is {metadata.get('format')!r}, expected {FORMAT!r}.")
     if check and weights_hash(state) != metadata["sha256"]:
@@ -85,8 +66,8 @@ def load_model(
 
 def describe(path: str | Path) -> dict[str, Any]:
     """Configuration, provenance and hashes of a model file, without loading its weights: `sha256` of all of them,
-    `encoder_sha256` of those that make latents (the former in files from before there was the latter)."""
-    metadata, _ = _read(Path(path), weights=False)
+    `encoder_sha256` of those that make latents (older files do not say it; `sha256` stands for it there)."""
+    metadata, _ = read_weights(Path(path), weights=False)
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path} is no cat3d model: its format is {metadata.get('format')!r}, expected {FORMAT!r}.")
     return {
@@ -99,28 +80,14 @@ def describe(path: str | Path) -> dict[str, Any]:
 
 def save_state(path: str | Path, state: dict[str, Tensor], metadata: dict[str, Any]) -> None:
     """Write tensors and JSON metadata (a trainer's state) to one file."""
-    _write(Path(path), {k: t.detach().cpu().contiguous() for k, t in state.items()}, {"state": json.dumps(metadata)})
+    write_weights(
+        Path(path), {k: t.detach().cpu().contiguous() for k, t in state.items()}, {"state": json.dumps(metadata)}
+    )
 
 
 def load_state(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """What `save_state` wrote."""
-    metadata, state = _read(Path(path))
+    metadata, state = read_weights(Path(path))
     if "state" not in metadata:
         raise ValueError(f"{path} is no saved training state.")
     return state, json.loads(metadata["state"])
-
-
-def _write(path: Path, state: dict[str, Tensor], metadata: dict[str, str]) -> None:
-    partial = path.with_name(path.name + ".partial")
-    save_file(state, partial, metadata)
-    partial.replace(path)
-
-
-def _read(path: Path, weights: bool = True) -> tuple[dict[str, str], dict[str, Tensor]]:
-    if not path.is_file():
-        raise FileNotFoundError(f"There is no model file {path}.")
-    try:
-        with safe_open(path, "pt") as file:
-            return file.metadata() or {}, {k: file.get_tensor(k) for k in file.keys()} if weights else {}  # noqa: SIM118
-    except SafetensorError as error:
-        raise ValueError(f"{path} is not a readable safetensors file ({error}).") from error

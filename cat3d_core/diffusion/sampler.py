@@ -45,34 +45,32 @@ def evaluations(config: SamplerConfig, schedule: Schedule) -> int:
 
 
 def sample(
-    model: MultiViewModel, condition_latents: Tensor, raymaps: Tensor, noise: Tensor, config: SamplerConfig
+    model: MultiViewModel, condition_latents: Tensor, cameras: Tensor, noise: Tensor, config: SamplerConfig
 ) -> Tensor:
     """Latents of target views given conditioning views, for G independent groups.
 
-    condition_latents [G, M, C, h, w]; raymaps [G, M+N, 6, h, w], conditioning views first, relative to the first of
-    them; noise [G, N, C, h, w] standard normal, keyed by view. Returns [G, N, C, h, w] float32 (float64 for float64
-    noise; the network runs in the dtype of its weights).
+    condition_latents [G, M, C, h, w]; cameras [G, M+N, 4, 4], conditioning views first, seen from the first of them
+    (`rays.reference_from_image`); noise [G, N, C, h, w] standard normal, keyed by view. Returns [G, N, C, h, w] float32
+    (float64 for float64 noise; the network runs in the dtype of its weights).
     Groups with fewer targets than the model was trained with (views - M) are padded with repeated targets, keeping the
     trained noise shift; the padding is dropped. Raises ValueError for shapes that don't fit together.
     """
     groups, given = condition_latents.shape[:2]
     targets = noise.shape[1]
     views = model.config.views
-    if noise.shape[0] != groups or raymaps.shape[:2] != (groups, given + targets):
+    if noise.shape[0] != groups or cameras.shape[:2] != (groups, given + targets):
         raise ValueError(
-            f"{groups} groups of {given} conditioning and {targets} target views need raymaps [{groups}, "
-            f"{given + targets}, 6, h, w] and noise [{groups}, {targets}, C, h, w]; got raymaps "
-            f"{tuple(raymaps.shape)} and "
-            f"noise {tuple(noise.shape)}."
+            f"{groups} groups of {given} conditioning and {targets} target views need cameras [{groups}, "
+            f"{given + targets}, 4, 4] and noise [{groups}, {targets}, C, h, w]; got cameras {tuple(cameras.shape)} "
+            f"and noise {tuple(noise.shape)}."
         )
     if given < 1 or targets < 1 or given + targets > views:
         raise ValueError(
             f"A group of this model has at least one conditioning and one target view and at most {views} views in "
-            f"all; "
-            f"got {given} + {targets}. Split the targets into more groups."
+            f"all; got {given} + {targets}. Split the targets into more groups."
         )
     dtype = torch.promote_types(noise.dtype, torch.float32)  # of the state
-    inputs = [condition_latents.to(dtype), *_pad_targets(raymaps.to(dtype), noise.to(dtype), views - given)]
+    inputs = [condition_latents.to(dtype), *_pad_targets(cameras.double(), noise.to(dtype), views - given)]
     batch = config.micro_batch or groups
     results = []
     for start in range(0, groups, batch):
@@ -82,7 +80,7 @@ def sample(
     return torch.cat(results)
 
 
-def _pad_targets(raymaps: Tensor, noise: Tensor, full: int) -> tuple[Tensor, Tensor]:
+def _pad_targets(cameras: Tensor, noise: Tensor, full: int) -> tuple[Tensor, Tensor]:
     """Repeat target views up to `full`. A repeated view gets its own noise, moved around in space: fresh noise without
     another key (the same noise twice would look to the network like a cleaner picture)."""
     targets = noise.shape[1]
@@ -91,26 +89,26 @@ def _pad_targets(raymaps: Tensor, noise: Tensor, full: int) -> tuple[Tensor, Ten
     rounds = -(-full // targets)
     flat = noise.flatten(-2)
     padded = torch.cat([flat.roll(round_ * (cells // rounds), -1) for round_ in range(rounds)], 1)[:, :full]
-    given = raymaps.shape[1] - targets
+    given = cameras.shape[1] - targets
     return (
-        torch.cat([raymaps[:, :given], raymaps[:, given + (index % targets)]], 1),
+        torch.cat([cameras[:, :given], cameras[:, given + (index % targets)]], 1),
         padded.unflatten(-1, noise.shape[-2:]),
     )
 
 
 @torch.no_grad()
 def _sample_batch(model: MultiViewModel, inputs: list[Tensor], config: SamplerConfig) -> Tensor:
-    latents, raymaps, noise = inputs
+    latents, cameras, noise = inputs
     schedule = Schedule(model.config.schedule, noise.shape[1])
     nodes = schedule.nodes(config.nodes, config.steps)
     times = schedule.time(nodes).tolist()
-    condition = make_condition(latents, raymaps)
+    condition = make_condition(latents, cameras)
 
     def clean(x: Tensor, i: int) -> Tensor:
         def predict(given: Condition, x: Tensor) -> Tensor:
             time = torch.full((x.shape[0],), times[i], device=x.device, dtype=x.dtype)
             full = torch.cat([given.latents, x], 1)
-            return model.unet(full, time, given.raymaps, given.mask)[:, given.latents.shape[1] :].to(x.dtype)
+            return model.unet(full, time, given.cameras, given.mask)[:, given.latents.shape[1] :].to(x.dtype)
 
         prediction = guided(predict, condition, x, float(nodes[i]), config.guidance)
         return schedule.clean(x, prediction, nodes[i])

@@ -57,18 +57,19 @@ def diffusion_loss(
     unet: MultiViewUNet,
     schedule: Schedule,
     latents: Tensor,
-    raymaps: Tensor,
+    cameras: Tensor,
     n_condition: int,
     random: torch.Generator,
     config: TrainConfig,
 ) -> Tensor:
     """Mean squared error of the prediction on target views, one value per group [G] float32.
 
-    latents [G, V, C, h, w] clean, conditioning views first (they stay clean); raymaps [G, V, 6, h, w]. Noise levels are
+    latents [G, V, C, h, w] clean, conditioning views first (they stay clean); cameras [G, V, 4, 4] as
+    the network wants them. Noise levels are
     stratified over the groups. `random` is a CPU generator, so the draw is the same on every device.
     """
     groups = latents.shape[0]
-    latents, raymaps = latents.float(), raymaps.float()
+    latents = latents.float()
     step = (torch.rand((), generator=random) + torch.arange(groups)) / groups % 1.0 * schedule.config.steps
     log_snr = schedule.log_snr[step.long().clamp(max=schedule.config.steps - 1)]
     dropped = torch.rand(groups, generator=random) < config.drop_probability
@@ -76,9 +77,9 @@ def diffusion_loss(
     noise = torch.randn(clean.shape, generator=random).to(clean.device)
     alpha, sigma = (s.float().to(clean.device)[:, None, None, None, None] for s in alpha_sigma(log_snr))
     noisy = alpha * clean + sigma * noise
-    condition = drop_condition(make_condition(latents[:, :n_condition], raymaps), dropped.to(clean.device), config.drop)
+    condition = drop_condition(make_condition(latents[:, :n_condition], cameras), dropped.to(clean.device), config.drop)
     time = schedule.time(log_snr).float().to(clean.device)
-    output = unet(torch.cat([condition.latents, noisy], 1), time, condition.raymaps, condition.mask)
+    output = unet(torch.cat([condition.latents, noisy], 1), time, condition.cameras, condition.mask)
     target = alpha * noise - sigma * clean if schedule.config.prediction == "v" else noise
     error = (output[:, n_condition:].float() - target).square().mean((1, 2, 3, 4))
     return error * _snr_weight(log_snr, schedule.config.prediction, config.min_snr_gamma).to(error)
@@ -127,8 +128,8 @@ class Trainer:
         """Optimizer steps made."""
         return self.calls // self.config.accumulate
 
-    def step(self, latents: Tensor, raymaps: Tensor, n_condition: int) -> dict[str, float]:
-        """One batch: latents [G, V, C, h, w], raymaps [G, V, 6, h, w], any float dtype, conditioning views first.
+    def step(self, latents: Tensor, cameras: Tensor, n_condition: int) -> dict[str, float]:
+        """One batch: latents [G, V, C, h, w], cameras [G, V, 4, 4], conditioning views first.
 
         Returns numbers to log: step, loss, lr, grad_norm (nan unless this call ended an accumulation). Raises
         FloatingPointError if the loss or the gradient is not finite; the weights are then those of the last good step.
@@ -136,8 +137,8 @@ class Trainer:
         rank, world = _rank_and_world()
         schedule = Schedule(self.model_config.schedule, latents.shape[1] - n_condition)
         random = generator(self.seed, "train", self.calls, rank)
-        latents, raymaps = latents.to(self.device), raymaps.to(self.device)
-        loss = diffusion_loss(self.unet, schedule, latents, raymaps, n_condition, random, self.config).mean()
+        latents, cameras = latents.to(self.device), cameras.to(self.device)
+        loss = diffusion_loss(self.unet, schedule, latents, cameras, n_condition, random, self.config).mean()
         value = float(loss.detach())
         if not math.isfinite(value):
             raise FloatingPointError(f"The training loss is {value} at step {self.steps}; lower the learning rate.")

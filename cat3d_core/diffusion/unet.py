@@ -10,6 +10,7 @@ from cat3d_core.diffusion.attention import SpatialTransformer, ViewFrames, zero_
 from cat3d_core.diffusion.conditioning import camera_vectors, ray_features, view_matrices
 from cat3d_core.diffusion.config import UNetConfig, ViewAttention
 from cat3d_core.diffusion.layers import Downsample, ResnetBlock, TimeMLP, Upsample, time_embedding
+from cat3d_core.rays import matrix_rays
 
 
 class MultiViewUNet(nn.Module):
@@ -56,11 +57,12 @@ class MultiViewUNet(nn.Module):
             elif isinstance(module, SpatialTransformer):
                 zero_(module.proj_out)
 
-    def forward(self, latents: Tensor, time: Tensor, raymaps: Tensor, mask: Tensor) -> Tensor:
+    def forward(self, latents: Tensor, time: Tensor, cameras: Tensor, mask: Tensor) -> Tensor:
         """Predict v or eps for every view.
 
         latents [G, V, C, h, w]: clean where conditioning, noisy where target; time [G] the network's time, any float;
-        raymaps [G, V, 6, h, w] relative to the first conditioning camera; mask [G, V], 1 = conditioning view.
+        cameras [G, V, 4, 4] seen from the first conditioning camera (`rays.reference_from_image`; zeros where the
+        pose is dropped), best in float64; mask [G, V], 1 = conditioning view.
         Returns [G, V, C, h, w] in the dtype of the weights.
         """
         groups, views, channels, height, width = latents.shape
@@ -72,14 +74,16 @@ class MultiViewUNet(nn.Module):
         mask_map = mask.to(latents.dtype)[:, :, None, None, None].expand(-1, -1, 1, height, width)
         parts = [latents, mask_map]
         if self.config.camera == "raymap":
-            parts.insert(1, ray_features(raymaps.to(latents.dtype), self.config.ray_octaves))
+            parts.insert(
+                1, ray_features(matrix_rays(cameras, height, width).to(latents.dtype), self.config.ray_octaves)
+            )
         x = torch.cat(parts, 2).flatten(0, 1).to(dtype)
         context = None
         if self.config.camera == "vector":
-            context = self.camera_embedding(camera_vectors(raymaps.float()).to(dtype)).flatten(0, 1)[:, None]
+            context = self.camera_embedding(camera_vectors(cameras).to(dtype)).flatten(0, 1)[:, None]
         frames = None
         if self.config.relative_cameras:
-            frames = ViewFrames(*(m.flatten(0, 1).to(dtype) for m in view_matrices(raymaps.float())))
+            frames = ViewFrames(*(m.flatten(0, 1).to(dtype) for m in view_matrices(cameras)))
         embedded = self.time_embedding(time_embedding(time, self.config.channels[0]).to(dtype))
         embedded = F.silu(embedded).repeat_interleave(views, 0)
 
@@ -169,7 +173,7 @@ def count_flops(config: UNetConfig, views: int = 8) -> int:
     with torch.device("meta"), torch.no_grad(), FlopCounterMode(display=False) as counter:
         latents = torch.empty(1, views, config.latent_channels, size, size)
         unet = MultiViewUNet(config)
-        unet(latents, torch.empty(1), torch.empty(1, views, 6, size, size), torch.empty(1, views))
+        unet(latents, torch.empty(1), torch.empty(1, views, 4, 4), torch.empty(1, views))
     return int(counter.get_total_flops())
 
 

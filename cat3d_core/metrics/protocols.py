@@ -111,7 +111,7 @@ def evaluate(
         masked = ", ".join(p.name for p in _ALL if p.mask != "none")
         raise ValueError(f"The protocol '{protocol.name}' defines no masked metrics; use one of {masked}, or no mask.")
     if prediction.ndim != 3 or target.ndim != 3:
-        raise ValueError("evaluate takes one view (3, H, W); use evaluate_batch for a batch (B, 3, H, W).")
+        raise ValueError("evaluate takes one view (3, H, W), not a batch; call it for each view.")
     prediction, target, mask = image_pair(prediction[None], target[None], None if mask is None else mask[None])
     _check_view(prediction, target, mask)
     prediction, target = (quantize(image.clamp(0.0, 1.0), protocol.quantize) for image in (prediction, target))
@@ -129,24 +129,3 @@ def evaluate(
     if perceptual is not None:
         result[perceptual.name] = float(perceptual(prediction, target, normalize=protocol.lpips_normalize))
     return result
-
-
-def evaluate_batch(
-    protocol: str | Protocol,
-    prediction: Tensor,
-    target: Tensor,
-    mask: Tensor | None = None,
-    perceptual: PerceptualDistance | None = None,
-) -> list[dict[str, float]]:
-    """`evaluate` for each view of a batch: prediction, target (B, 3, H, W), mask (B, H, W).
-
-    Views are taken one at a time, so memory does not grow with B. Errors name the view's index.
-    """
-    rows = []
-    for view in range(prediction.shape[0]):
-        try:
-            view_mask = None if mask is None else mask[view]
-            rows.append(evaluate(protocol, prediction[view], target[view], view_mask, perceptual))
-        except ValueError as error:
-            raise ValueError(f"View {view}: {error}") from error
-    return rows

@@ -9,17 +9,20 @@ from cat3d_core.stress import (
     diffusion,
     geometry,
     intervals,
+    matching,
     metrics,
     networks,
     poses,
     rendering,
     splats,
     training,
-)
+)  # fmt: skip
 from cat3d_core.stress.routine import Exact, Routine
 from cat3d_core.stress.search import Finding, stress
 
-_SUBJECTS = (geometry, poses, coordinates, intervals, rendering, splats, training, diffusion, networks, metrics)
+_SUBJECTS = (
+    geometry, poses, coordinates, intervals, rendering, training, diffusion, networks, metrics, matching, splats,
+)  # fmt: skip
 ROUTINES = [routine for subject in _SUBJECTS for routine in subject.ROUTINES]
 
 __all__ = ["ROUTINES", "Exact", "Finding", "Routine", "stress"]

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.coverage import bin_of
-from cat3d_core.diffusion.conditioning import camera_vectors, relative_raymaps
-from cat3d_core.rays import pixel_rays, raymap
+from cat3d_core.diffusion.conditioning import camera_vectors, view_matrices
+from cat3d_core.rays import pixel_rays, raymap, reference_from_image
 from cat3d_core.stress.draw import Draw
 from cat3d_core.stress.routine import ROUNDING, Call, Exact, Reference, Routine, each, zero
 
@@ -190,8 +190,8 @@ def _vector_inputs(draw: Draw) -> tuple[Tensor, ...]:
 
 def _vector(k: Tensor, rotation: Tensor, center: Tensor) -> Tensor:
     """Position and focal length, and the rotation that the quaternion stands for."""
-    maps = raymap(cameras_of(k, pose_of(rotation, center)), torch.eye(4, dtype=k.dtype), 8, 8)
-    vector = camera_vectors(maps)
+    matrices = reference_from_image(cameras_of(k, pose_of(rotation, center)), torch.eye(4, dtype=k.dtype))
+    vector = camera_vectors(matrices.to(k.dtype))
     q = vector[:, 3:7]
     w, xyz = q[:, :1, None], q[:, 1:]
     zero_ = torch.zeros_like(q[:, 0])
@@ -203,26 +203,34 @@ def _vector(k: Tensor, rotation: Tensor, center: Tensor) -> Tensor:
 
 def _vector_reference(k: Tensor, rotation: Tensor, center: Tensor) -> Exact:
     focal = k[:, :1, 0] / _SIZE
-    # Neighbouring rays of a long lens differ by 1 / focal only, so their rounding counts that much more.
-    ones = torch.ones_like(focal) * (1 + focal) ** 2
-    scale = torch.cat([length(center)[:, None].expand(-1, 3), focal * ones, ones.expand(-1, 9)], -1)
+    scale = torch.cat([length(center)[:, None].expand(-1, 3), focal, torch.ones(len(k), 9)], -1)
     return Exact(torch.cat([center, focal, rotation.flatten(1)], -1), scale)
 
 
-def _relative_inputs(draw: Draw) -> tuple[Tensor, ...]:
-    return draw.signed(3), draw.direction()[:, 0], pose_of(draw.rotation()[:, 0], draw.signed(3))
+def _matrix_inputs(draw: Draw) -> tuple[Tensor, ...]:
+    """A lens, a pose, and a point given by its place in the image (u, v in [-1, 1]) and its depth."""
+    k, rotation, center = _vector_inputs(draw)
+    return k, rotation, center, torch.cat([draw.between(2, -1.0, 1.0), draw.log_between(1, 1e-3, 1e3)], -1)
 
 
-def _relative(origin: Tensor, direction: Tensor, pose: Tensor) -> Tensor:
-    world = torch.cat([origin, direction], -1)[:, None, :, None, None]
-    return relative_raymaps(world, pose)[:, 0, :, 0, 0]
+def _matrices(k: Tensor, rotation: Tensor, center: Tensor, place: Tensor) -> Tensor:
+    """The point in the world, and back in the image."""
+    matrices = reference_from_image(cameras_of(k, pose_of(rotation, center)), torch.eye(4, dtype=k.dtype))
+    there, back = view_matrices(matrices)
+    depth = place[:, 2:].double()
+    image = torch.cat([place[:, :2].double() * depth, depth, torch.ones_like(depth)], -1)[..., None]
+    world = back @ image
+    return torch.cat([world[:, :3, 0], (there @ world)[:, :3, 0]], -1).to(k.dtype)
 
 
-def _relative_reference(origin: Tensor, direction: Tensor, pose: Tensor) -> Exact:
-    rotation = pose[:, :3, :3]
-    local = [((x[:, :, None]) * rotation).sum(1) for x in (origin - pose[:, :3, 3], direction)]
-    reach = (length(origin) + length(pose[:, :3, 3]))[:, None].expand(-1, 3)
-    return Exact(torch.cat(local, -1), torch.cat([reach, torch.ones_like(reach)], -1))
+def _matrices_reference(k: Tensor, rotation: Tensor, center: Tensor, place: Tensor) -> Exact:
+    depth, focal = place[:, 2:], k[:, :1, 0] / _SIZE
+    local = torch.cat([place[:, :2] * depth / (2 * focal), depth], -1)
+    world = (rotation * local[:, None]).sum(-1) + center
+    # Of a far centre the point's own place is rounded away; a long lens enlarges what is left.
+    reach = (length(local) + length(center))[:, None]
+    scale = torch.cat([reach.expand(-1, 3), (reach * (1 + 2 * focal)).expand(-1, 3)], -1)
+    return Exact(torch.cat([world, place[:, :2] * depth, depth], -1), scale)
 
 
 ROUTINES = [
@@ -256,11 +264,11 @@ ROUTINES = [
         _raymap_inputs, _raymap(True), _raymap_reference(True), ROUNDING, share=0.1,
     ),
     Routine(
-        "conditioning.relative_raymaps", "rays moved into another pose's frame",
-        _relative_inputs, _relative, _relative_reference, ROUNDING,
+        "conditioning.view_matrices", "a point of the image into the world, and back, worked in float64",
+        _matrix_inputs, _matrices, _matrices_reference, ROUNDING,
     ),
     Routine(
-        "conditioning.camera_vectors", "position, rotation and focal length read off a raymap",
+        "conditioning.camera_vectors", "position, rotation and focal length read off a matrix",
         _vector_inputs, _vector, _vector_reference, ROUNDING,
     ),
 ]  # fmt: skip

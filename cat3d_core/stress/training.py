@@ -83,6 +83,30 @@ def _distortion_reference(t: Tensor, w: Tensor) -> Exact:
     return Exact(value, (value + far[:, -1] * total * total).detach())
 
 
+def _depth_inputs(draw: Draw) -> tuple[Tensor, ...]:
+    """A histogram from the camera to far away, thin intervals included, and an inverse depth at any place."""
+    t = draw.edges(9) * draw.log_between(1, 1e-6, 1e6)
+    return t, draw.magnitude(8, 1e-12, 0.1), draw.log_between(1, 1e-6, 1e2), draw.unit(1)
+
+
+def _depth(t: Tensor, w: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+    return losses.inverse_depth(Round(t[None], t[None], w[None]), target, weight)
+
+
+def _depth_slope(t: Tensor, w: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor]:
+    """Where the two inverse depths nearly agree, their rounding decides the slope of the Charbonnier distance."""
+    rendered = (2 * w / (t[:, 1:] + t[:, :-1]).clamp_min(2 * losses.NEAREST)).sum(-1)
+    noise = 1 + (rendered + target[:, 0]) / _EPS
+    return (weight[:, 0] * noise * (2 / (t[:, 1:] + t[:, :-1]).clamp_min(2 * losses.NEAREST)).amax(-1),)
+
+
+def _depth_reference(t: Tensor, w: Tensor, target: Tensor, weight: Tensor) -> Exact:
+    """Twice the weight over the sum of the edges; what two inverse depths nearly have in common cancels."""
+    rendered = (2 * w / (t[:, 1:] + t[:, :-1]).clamp_min(2 * losses.NEAREST)).sum(-1)
+    target, weight = target[:, 0], weight[:, 0]
+    return Exact(weight * torch.hypot(rendered - target, torch.tensor(_EPS)), weight * (rendered + target + _EPS))
+
+
 def _trust_inputs(draw: Draw) -> tuple[Tensor, ...]:
     return draw.signed(9).view(-1, 3, 3), draw.unit(1)
 
@@ -162,6 +186,11 @@ ROUTINES = [
     Routine(
         "losses.distortion", "over ladder distance up to 1e12", _distortion_inputs, each(_distortion),
         _distortion_reference, {SINGLE: 1e-6}, share=0.1,
+    ),
+    Routine(
+        "losses.inverse_depth", "known inverse depths from 1e-6 to 100, with the slope by the weights",
+        _depth_inputs, each(_depth), _depth_reference, {SINGLE: 2e-6}, {SINGLE: 2e-6}, share=0.1, wrt=(1,),
+        gradient_scale=_depth_slope,
     ),
     Routine(
         "losses.view_weights", "weights of generated views at any distance", _trust_inputs, each(_trust),

@@ -20,10 +20,12 @@ _COARSE = 12
 
 @dataclass(frozen=True)
 class Capture:
-    """V views of one scene: image (V, 3, H, W) in [0, 1]; cameras of the normalised scene, float64."""
+    """V views of one scene: image (V, 3, H, W) in [0, 1]; cameras of the normalised scene, float64; where asked for,
+    inverse_depth (V, H, W): 1 / z-depth at pixel centres in that scene's unit, 0 for the sky."""
 
     image: Tensor
     cameras: Cameras
+    inverse_depth: Tensor | None = None
 
 
 def surface_points(depth: Tensor, cameras: Cameras) -> Tensor:
@@ -38,9 +40,10 @@ def surface_points(depth: Tensor, cameras: Cameras) -> Tensor:
 
 
 def training_capture(
-    family: str, seed: int, views: int, size: int, textures: Tensor | None = None, device: torch.device | str = "cpu"
-) -> Capture:
-    """A random scene of the family, seen from a capture of random spread, image on the CPU.
+    family: str, seed: int, views: int, size: int, textures: Tensor | None = None,
+    device: torch.device | str = "cpu", with_depth: bool = False,
+) -> Capture:  # fmt: skip
+    """A random scene of the family, seen from a capture of random spread, on the CPU; with_depth: also inverse depth.
 
     As in use, some captures are normalised with sparse surface points and some from their cameras alone.
     Raises ValueError where the scene has no free place for the cameras (take the next seed).
@@ -49,11 +52,16 @@ def training_capture(
     spread, with_points = torch.rand(2, generator=generator(seed, "capture")).tolist()
     cameras = random_cameras(scene, seed, views, size, size, spread=0.35 + 0.65 * spread)
     scene = scene.to(device)
-    image = render_views(scene, cameras.to(device, torch.float32))[0].cpu()
+    depth = None
+    if with_depth:
+        image, depth, _ = (part.cpu() for part in trace(scene, cameras))
+    else:
+        image = render_views(scene, cameras.to(device, torch.float32))[0].cpu()
     points = None
     if with_points < 0.7:
         points = surface_points(trace(scene, cameras.resize(_COARSE, _COARSE), supersample=1).depth, cameras)
-    return Capture(image, normalize_scene(cameras, points).cameras(cameras))
+    similarity = normalize_scene(cameras, points)
+    return Capture(image, similarity.cameras(cameras), None if depth is None else 1 / (depth * similarity.scale))
 
 
 def mirrored(capture: Capture) -> Capture:
@@ -64,7 +72,10 @@ def mirrored(capture: Capture) -> Capture:
     intrinsics[:, 0, 2] = cameras.size[:, 0] - intrinsics[:, 0, 2]
     intrinsics[:, 0, 1] *= -1
     pose = mirror @ cameras.world_from_camera @ mirror
-    return Capture(capture.image.flip(-1), replace(cameras, intrinsics=intrinsics, world_from_camera=pose))
+    inverse_depth = None if capture.inverse_depth is None else capture.inverse_depth.flip(-1)
+    return Capture(
+        capture.image.flip(-1), replace(cameras, intrinsics=intrinsics, world_from_camera=pose), inverse_depth
+    )
 
 
 def recoloured(capture: Capture, random: torch.Generator) -> Capture:

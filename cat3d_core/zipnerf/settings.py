@@ -11,10 +11,15 @@ from cat3d_core.reconstruction.protocol import ReconstructionRequest
 from cat3d_core.reconstruction.views import Views
 from cat3d_core.zipnerf.config import PRESETS, ZipNerfConfig
 
-#: `skip.rays`: steps that see as many rays as there are pixels, at least, and the fewest rays of a step. With generated
-#: views, whose pixels are many and uncertain, a step does with this share of its rays if all steps together still see
-#: as many as twice the pixels: short trainings need them all (150 steps: up to 1.2 dB).
-PASSES, FEWEST_RAYS, GENERATED_SHARE, LEAST_PASSES = 24, 256, 0.75, 2
+#: `skip.rays`: so many steps see as many rays as there are pixels, at least.
+PASSES = 24
+#: `skip.rays`: the fewest rays of a step.
+FEWEST_RAYS = 256
+#: `skip.rays` with generated views, whose pixels are many and uncertain: a step does with this share of its rays.
+GENERATED_SHARE = 0.75
+#: ... if all steps together still see so many times as many rays as there are pixels: short trainings need them all
+#: (150 steps: up to 1.2 dB).
+LEAST_PASSES = 2
 #: `skip.plateau` with more captured views than this: their pixels tell how well other views are met, so training goes
 #: on for as long as they improve at all. (With few views they only tell how well those are remembered.)
 FEW_VIEWS = 9
@@ -25,6 +30,8 @@ GENERATED: dict[str, Any] = {"plateau_from": 0.4, "plateau_cooldown": 0.2}
 #: CAT3D: LPIPS weight 1 on CO3D and mip-NeRF 360, 0.25 elsewhere.
 STRONG_LPIPS = 4.0
 STRONG_LPIPS_DATASETS = ("co3d", "mip360", "mipnerf360")
+#: Where generated views come with depths; measured on the procedural families (docs/explanation/geometry.md).
+DEPTHS: dict[str, Any] = {"depth_prior": 0.1, "depth_prior_until": 0.6}
 #: Settings younger than stored fields: at their defaults they are left out of what identifies a field, so that those
 #: stay what is wanted.
 YOUNGER = ("depth_prior", "depth_prior_until")
@@ -55,6 +62,8 @@ def chosen_config(request: ReconstructionRequest) -> ZipNerfConfig:
         config = dataclasses.replace(config, lpips_weight=0.0)
     elif request.dataset in STRONG_LPIPS_DATASETS:
         config = dataclasses.replace(config, lpips_weight=STRONG_LPIPS * config.lpips_weight)
+    if request.depths:
+        config = dataclasses.replace(config, **DEPTHS)
     iterations = request.overrides.get("iterations", config.iterations)
     off = ZipNerfConfig()  # as in the paper: nothing is skipped
     for name, changes in skip_settings(iterations if isinstance(iterations, int) else config.iterations).items():

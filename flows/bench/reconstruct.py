@@ -72,9 +72,7 @@ def train_and_measure(
     errors, relative = [], []
     for index in range(len(test)):
         out = render_image(trainer.field, test.cameras, index, config)
-        height, width = out.depth.shape
-        first = int(test.offset[index])
-        truth = test.pixels[first : first + height * width].view(height, width, 3).float() / 255
+        truth = test.image(index).float() / 255
         errors.append(-10 * math.log10(float((out.image.cpu() - truth).square().mean())))
         seen = torch.isfinite(depths[index]) & (depths[index] > 0)
         relative.append(float(((out.depth.cpu() - depths[index]).abs() / depths[index])[seen].mean()))

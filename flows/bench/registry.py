@@ -7,7 +7,6 @@ benchmark set a cost against an error or a quality: the front is worth choosing 
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,16 +14,17 @@ from typing import Any
 
 import torch
 
-from cat3d_core.diffusion import GuidanceConfig, SamplerConfig, load_model
-from cat3d_core.diffusion.checkpoint import describe
+from cat3d_core.diffusion import GuidanceConfig
+from cat3d_core.generation.advice import MEASURED
 from cat3d_core.metrics.perceptual import find_perceptual
 from cat3d_core.weights import default_model_path
 from cat3d_core.zipnerf import PRESETS
-from flows.bench import metrics, model, plan, poses, reconstruct, sampler, scenes, skips, splats, store, synthetic
+from flows.bench import metrics, plan, poses, reconstruct, sampler, scenes, skips, splats, store, synthetic
 from flows.errors import InputError
-from flows.generation.model import GUIDANCE_INTERVAL, SAMPLER_DEFAULT
+from flows.generation.formats import cat3d
 from flows.media.images import read_image
 from flows.readers import read_capture
+from flows.training import evaluation
 from schemas.config import PosesConfig, ReconstructConfig, SampleConfig
 
 Row = dict[str, Any]
@@ -89,14 +89,13 @@ def _scenes(data: Path | None, names: list[str]) -> list[Path]:
 
 def sampler_rows(quick: bool, data: Path | None) -> list[Row]:
     """The closed-form mixture, and in full also the shipped model where there is one."""
-    chosen = {n: SAMPLER_DEFAULT[n] for n in ("solver", "nodes", "steps")} | {"dtype": SampleConfig().precision}
-    steps = tuple(sorted({8, 10, 20, 50, SAMPLER_DEFAULT["steps"]} | (set() if quick else {12, 15, 30})))
+    chosen = {n: getattr(MEASURED, n) for n in ("solver", "nodes", "steps")} | {"dtype": SampleConfig().precision}
+    steps = tuple(sorted({8, 10, 20, 50, MEASURED.steps} | (set() if quick else {12, 15, 30})))
     rows = sampler.rows(None, steps, groups=8 if quick else 64)
     if not quick:
         with contextlib.suppress(MissingError):
             rows += sampler.rows(_model_file(), steps)
-    low, high = GUIDANCE_INTERVAL
-    bounds = (-math.inf if low is None else low, math.inf if high is None else high)
+    bounds = MEASURED.guidance.low_log_snr, MEASURED.guidance.high_log_snr
     interval = next(name for name, found in sampler.INTERVALS.items() if found == bounds)
     return _marked(rows, chosen | {"interval": interval, "problem": "mixture"})  # a model's file has its own default
 
@@ -176,14 +175,15 @@ def store_rows(quick: bool, data: Path | None) -> list[Row]:
 
 def model_rows(quick: bool, data: Path | None) -> list[Row]:
     """As the model's file recommends to sample."""
-    path = _model_file()
-    chosen = SAMPLER_DEFAULT | describe(path)["provenance"].get("sampler", {})
-    config = SamplerConfig(chosen["solver"], chosen["nodes"], chosen["steps"], GuidanceConfig(chosen["guidance"]))
-    rows = model.rows(
-        load_model(path), 1 if quick else 20, (3,) if quick else (3, 1), config, find_perceptual(),
-        captured=model.captured_scenes(data),
+    generator = cat3d.load(_model_file(), "cpu", "float32")
+    advice = generator.spec.advice
+    config = replace(advice, guidance=GuidanceConfig(advice.guidance.scale))  # everywhere: the model's own, undiluted
+    rows = evaluation.rows(
+        generator, 1 if quick else 20, (3,) if quick else (3, 1), config, find_perceptual(),
+        captured=evaluation.captured_scenes(data),
     )  # fmt: skip
-    return [row | {name: chosen[name] for name in SAMPLER_DEFAULT} for row in rows]
+    chosen = {name: getattr(config, name) for name in ("solver", "nodes", "steps")}
+    return [row | chosen | {"guidance": config.guidance.scale} for row in rows]
 
 
 def skip_rows(quick: bool, data: Path | None) -> list[Row]:

@@ -28,7 +28,7 @@ from cat3d_core.random import generator
 INTERVALS = {"all": (-math.inf, math.inf), "below 2": (-math.inf, 2.0), "middle": (-5.0, 2.0)}
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 REFERENCE = ("dpm++", "log_snr", 1000)
-Problem = tuple[MultiViewModel, Tensor, Tensor, Tensor]  # model, conditioning latents, raymaps, noise
+Problem = tuple[MultiViewModel, Tensor, Tensor, Tensor]  # model, conditioning latents, cameras, noise
 
 
 class MixtureNetwork(nn.Module):
@@ -47,7 +47,7 @@ class MixtureNetwork(nn.Module):
         means = torch.randn(modes, size, generator=generator(0, "mixture"), dtype=torch.float64)
         self.means = nn.Parameter(means * (1 - std**2) ** 0.5, requires_grad=False)
 
-    def forward(self, latents: Tensor, time: Tensor, raymaps: Tensor, mask: Tensor) -> Tensor:
+    def forward(self, latents: Tensor, time: Tensor, cameras: Tensor, mask: Tensor) -> Tensor:
         dtype = self.means.dtype
         x = latents[:, -self.targets :].flatten(1).double()
         alpha, sigma = (float(s) for s in alpha_sigma(self._log_snr(float(time[0]))))
@@ -81,27 +81,27 @@ def mixture_problem(groups: int = 64, given: int = 3) -> Problem:
     model = MultiViewModel(config)
     model.unet = MixtureNetwork(config, targets, shape)  # type: ignore[assignment]
     noise = torch.randn(groups, targets, *shape, generator=generator(0, "noise"))
-    return model, torch.zeros(groups, given, *shape), torch.zeros(groups, config.views, 6, 4, 4), noise
+    return model, torch.zeros(groups, given, *shape), torch.zeros(groups, config.views, 4, 4), noise
 
 
 @torch.no_grad()
 def model_problem(path: Path, groups: int = 2, given: int = 3) -> Problem:
     """A model file and groups of held-out procedural scenes."""
     from cat3d_core.random import normal
-    from cat3d_core.rays import raymap
+    from cat3d_core.rays import reference_from_image
     from cat3d_core.synthetic import FAMILIES
-    from flows.bench.model import held_out_group
+    from cat3d_core.synthetic.held_out import held_out_group
 
     model = load_model(path)
     parts = []
     for number in range(groups):
         traced, cameras = held_out_group(FAMILIES[number % len(FAMILIES)], number, model.config.image_size)
         latents = model.autoencoder.encode(traced.image)
-        rays = raymap(cameras, cameras.world_from_camera[0], *latents.shape[-2:]).float()
+        seen = reference_from_image(cameras, cameras.world_from_camera[0])
         noise = torch.stack([normal(latents.shape[1:], 0, number, v, "noise") for v in range(given, len(latents))])
-        parts.append((latents[:given], rays, noise))
-    latents, raymaps, noise = (torch.stack(part) for part in zip(*parts, strict=True))
-    return model, latents, raymaps, noise
+        parts.append((latents[:given], seen, noise))
+    latents, seen, noise = (torch.stack(part) for part in zip(*parts, strict=True))
+    return model, latents, seen, noise
 
 
 def rows(
@@ -114,13 +114,13 @@ def rows(
     name, problem = ("mixture", mixture_problem(groups or 64))
     if model_path is not None:
         name, problem = "model", model_problem(model_path, groups or 2)
-    model, latents, raymaps, noise = problem
+    model, latents, cameras, noise = problem
     references = {}
     model.unet.double()
     for interval, (low, high) in INTERVALS.items():
         solver, nodes, count = REFERENCE
         config = SamplerConfig(solver, nodes, count, GuidanceConfig(3.0, low, high))  # type: ignore[arg-type]
-        references[interval] = sample(model, latents.double(), raymaps.double(), noise.double(), config)
+        references[interval] = sample(model, latents.double(), cameras, noise.double(), config)
     result = []
     for dtype_name, dtype in DTYPES.items():
         model.unet.to(dtype)
@@ -138,9 +138,9 @@ def rows(
 
 
 def _measure(problem: Problem, config: SamplerConfig, reference: Tensor, guided: Tensor) -> dict[str, float]:
-    model, latents, raymaps, noise = problem
+    model, latents, cameras, noise = problem
     start = time.perf_counter()
-    out = sample(model, latents, raymaps, noise, config)
+    out = sample(model, latents, cameras, noise, config)
     seconds = time.perf_counter() - start
     error = (out.double() - reference).square().mean((1, 2, 3, 4)).sqrt()
     return {

@@ -59,9 +59,7 @@ def row(folder: Path, split: str, config: ZipNerfConfig, downscale: int, seed: i
     started, found = time.perf_counter(), []
     for index in range(len(held)):
         image = render_image(trainer.field, held.cameras, index).image
-        height, width = image.shape[:2]
-        first = int(held.offset[index])
-        truth = held.pixels[first : first + height * width].view(height, width, 3).float() / 255
+        truth = held.image(index).float() / 255
         found.append(evaluate(PROTOCOL, image.permute(2, 0, 1), truth.permute(2, 0, 1)))
     return {
         "scene": folder.name, "split": split, "train_views": len(train), "test_views": len(held),

@@ -69,7 +69,7 @@ def sources(data: Path | None, real: Sequence[str] = REAL) -> Iterator[tuple[str
 
 
 def longer_side(scene: Path) -> int:
-    """Of the first view, in pixels."""
+    """The longer side of the scene's first photo, in pixels."""
     from flows.media.images import image_size
 
     return max(image_size(read_capture(scene).paths[0]))
@@ -257,4 +257,4 @@ def write_tables(page: Path, table: Path) -> None:
 
 
 if __name__ == "__main__":
-    write_tables(Path("docs/explanation/skips.md"), Path("docs/reference/benchmarks/skips.parquet"))
+    write_tables(Path("docs/log/2026-11-28_skips.md"), Path("docs/reference/benchmarks/skips.parquet"))

@@ -13,12 +13,13 @@ from cat3d_core.splats import REFINE
 from cat3d_core.splats.viewpoints import between
 from flows.errors import InputError
 from flows.exports.dataset import write_dataset
-from flows.exports.mesh import fuse, import_open3d, without_crumbs, write_mesh_glb, write_mesh_ply
+from flows.exports.mesh import fuse, without_crumbs, write_mesh_glb, write_mesh_ply
 from flows.exports.path import read_path, write_renders
 from flows.exports.ply import write_ply
 from flows.exports.source import Source, open_source, render_views, surface_cameras, training_images
 from flows.exports.splats import MOST, splats_of, write_splats
 from flows.media.images import to_uint8
+from flows.open3d_import import import_open3d
 from flows.progress import console
 
 KINDS = ("mesh", "points", "splats", "dataset", "renders")
@@ -68,7 +69,7 @@ def export_command(
     settings = settings or SurfaceSettings()
     kinds = _kinds(what, path_file)
     if "mesh" in kinds:
-        import_open3d()  # before minutes of rendering
+        import_open3d("Meshes")  # before minutes of rendering
     source = open_source(path, run_name, frame)
     first = source.store.captured.read("size")[0].tolist()
     camera_path = read_path(path_file, *first) if path_file is not None else None

@@ -11,6 +11,7 @@ from rich.table import Table
 from cat3d_core.diffusion import SIZES, count_flops, count_parameters, describe
 from cat3d_core.weights import default_model_path
 from flows.errors import InputError
+from flows.generation.open import format_names
 from flows.progress import console
 
 
@@ -28,6 +29,7 @@ def models_command(describe_size: str | None, model: Path | None, as_json: bool)
         console.print("No model is installed; train one with `cat3d train`.")
     for report in reports:
         console.print(_pairs(report, report["path"]))
+    console.print(f"Generators (sample.generator): {', '.join(format_names())}.")
 
 
 def installed() -> list[Path]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from flows.generation.plan import read_plan
 from flows.jobs.job import Job
 from flows.jobs.request import Request
 from flows.media.plan_drawing import plan_table
 from flows.pipeline.runner import opened, run_missing
 from flows.progress import console
-from flows.stages.plan import plan_run
 from schemas.scene_store import SceneStore
 
 
@@ -29,7 +29,6 @@ def plan_command(request: Request, rows: int = 24) -> list[Job]:
 def show_plan(job: Job, rows: int) -> None:
     """Print the plan's groups, its reasons and where its picture is."""
     store = SceneStore.open(job.store_path)
-    plan, train = plan_run(job, store, store.run(job.run))
-    names = store.captured.read("name")
-    console.print(plan_table(plan, [str(names[v]) for v in train], rows))
+    names = [str(name) for name in store.captured.read("name")]
+    console.print(plan_table(read_plan(store.run(job.run).plan, len(names)), names, rows))
     console.print(f"Picture: {job.pictures / 'plan.png'}")

@@ -21,9 +21,12 @@ from flows.training.model import history, model_config, starting_config, startin
 from flows.training.prepare import claim, prepare
 from flows.training.ranks import Ranks, ranks
 from flows.training.sheets import held_out
+from flows.training.sweep import train_sweep
+from flows.training.worlds import package as worlds
 from schemas.config import load_config, parse_config
 from schemas.errors import ConfigError
 from schemas.settings import merged, settings_document
+from schemas.sweep_training import Kind, SweepRunConfig
 from schemas.tables import read_rows
 from schemas.training import SAMPLES, TRAINING, TrainRunConfig
 
@@ -41,30 +44,40 @@ def train_command(
     """Do what is not done yet of a training, or only of its bank. Raises InputError and ConfigError, in a sentence."""
     if list_presets or not config:
         for path in sorted(PRESETS.glob("*.yaml")):
-            preset = load_config(path, TrainRunConfig)
+            preset = load_config(path, kind_of(path))
             console.print(f"[bold]{path.stem}[/bold]  {preset.note}")
         return
     asked = training_config(config, given, settings)
     with _sentences(config), ranks(asked.device) as own:
         console.quiet = not own.first
         with _only_one(out, TABLES) if own.first else contextlib.nullcontext():
-            run_training(asked, out, own, bank_only)
+            if isinstance(asked, SweepRunConfig):
+                train_sweep(asked, out, own, bank_only)
+            else:
+                run_training(asked, out, own, bank_only)
 
 
-def training_config(config: str, given: dict[str, Any], settings: Sequence[str]) -> TrainRunConfig:
+def kind_of(path: Path) -> type[TrainRunConfig] | type[SweepRunConfig]:
+    """What a file configures, by its `kind`: a training of the plane sweep, or else of the diffusion model."""
+    found = load_config(path, Kind).kind
+    return SweepRunConfig if found == "sweep" else TrainRunConfig
+
+
+def training_config(config: str, given: dict[str, Any], settings: Sequence[str]) -> TrainRunConfig | SweepRunConfig:
     """File or preset, then --set, then options. An option that ends the training (steps, minutes) replaces the
     other. Raises InputError for neither file nor preset, ConfigError for a bad field."""
     path = Path(config) if Path(config).is_file() else PRESETS / f"{config}.yaml"
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in PRESETS.glob("*.yaml")))
         raise InputError(f"{config} is neither a file nor a shipped preset; shipped are {known}.")
-    document = load_config(path, TrainRunConfig).model_dump(mode="json")
+    kind = kind_of(path)
+    document = load_config(path, kind).model_dump(mode="json")
     changes = merged(settings_document(settings), {name: value for name, value in given.items() if value is not None})
     if changes.get("steps") is not None:
         document["minutes"] = None
     elif changes.get("minutes") is not None:
         document["steps"] = None
-    return parse_config(merged(document, changes), config, TrainRunConfig)
+    return parse_config(merged(document, changes), config, kind)
 
 
 def run_training(config: TrainRunConfig, out: Path, own: Ranks, bank_only: bool = False) -> None:
@@ -89,7 +102,8 @@ def run_training(config: TrainRunConfig, out: Path, own: Ranks, bank_only: bool 
     families, textures = ", ".join(config.bank.families), config.bank.textures
     origin = {
         "data": f"procedural scenes of cat3d_core.synthetic ({families})"
-        + (f", textures from {textures.name}" if textures else ""),
+        + (f", textures from {textures.name}" if textures else "")
+        + (f", tracks of Debian's {worlds.PACKAGE}: {', '.join(worlds.TRAINING)}" if config.bank.worlds else ""),
         "training": json.loads(config.model_dump_json()), "versions": provenance(), "ranks": own.world,
     }  # fmt: skip
     if config.start is not None:

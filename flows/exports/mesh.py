@@ -1,13 +1,12 @@
 """TSDF fusion of rendered depth into one coloured triangle mesh (Open3D), and its files (PLY, GLB).
 
-Curless and Levoy 1996, on sparse voxel blocks (Open3D's VoxelBlockGrid). The only place that imports Open3D.
+Curless and Levoy 1996, on sparse voxel blocks (Open3D's VoxelBlockGrid).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +17,7 @@ from cat3d_core.normalization import Similarity
 from cat3d_core.rays import image_rays
 from flows.errors import InputError
 from flows.exports.ply import write_bytes, write_ply
+from flows.open3d_import import import_open3d
 
 BLOCK = 8  # voxels per block side
 TRUNCATION = 5.0  # voxels, as zipnerf-pytorch's tsdf.py
@@ -39,19 +39,6 @@ class Mesh(NamedTuple):
         return self._replace(vertices=vertices, normals=normals)
 
 
-def import_open3d() -> ModuleType:
-    """Open3D, or InputError with the line to type where it or its system library is missing."""
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        if "libusb" in str(error):
-            raise InputError(
-                "Meshes need Open3D, which needs the system library libusb; type  sudo apt-get install -y libusb-1.0-0"
-            ) from None
-        raise InputError(f"Meshes need Open3D ({error}); type  pip install open3d-cpu") from None
-    return open3d
-
-
 def fuse(
     views: Iterable[tuple[torch.Tensor, torch.Tensor]], cameras: Cameras, voxel: float, min_views: int = 2
 ) -> Mesh:
@@ -61,7 +48,7 @@ def fuse(
     finer than the cameras'. Surface that fewer than `min_views` views confirm is left out.
     Raises InputError where nothing is left.
     """
-    o3d = import_open3d()
+    o3d = import_open3d("Meshes")
     core = o3d.core
     grid = o3d.t.geometry.VoxelBlockGrid(
         ("tsdf", "weight", "color"), (core.float32,) * 3, ((1), (1), (3)), voxel, BLOCK, 10_000

@@ -12,10 +12,10 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.normalization import Similarity
 from cat3d_core.reconstruction import Reconstructor, Render
 from flows.errors import InputError
+from flows.generation.views import generated_views
 from flows.jobs.access import read_cameras, read_images, read_similarity, views_with_role
 from flows.progress import meter
 from flows.reconstruction.stored import read_reconstruction
-from flows.stages.training_views import generated_views
 from schemas.scene_store import Run, SceneStore
 
 FRAMES = ("world", "scene")
@@ -65,7 +65,7 @@ def training_images(source: Source) -> PosedImages:
     cameras, images = [read_cameras(store.captured, train)], read_images(store.captured, train)
     names: list[str | None] = [str(name) for name in store.captured.read("name")[train]]
     if "done_image" in run.generated:
-        for camera, image in generated_views(run):
+        for camera, image, *_ in generated_views(run):
             cameras.append(camera)
             images.append(image)
             names.append(None)
@@ -78,7 +78,7 @@ def surface_cameras(source: Source, limit: int) -> Cameras:
     store, run = source.store, source.run
     cameras = [read_cameras(store.captured, views_with_role(store, run, "train"))]
     if "done_image" in run.generated:
-        cameras += [camera for camera, _ in generated_views(run)]
+        cameras += [view.camera for view in generated_views(run)]
     if "path" in run.section("renders"):
         cameras.append(read_cameras(run.renders("path")))
     every = Cameras.cat(cameras)

@@ -1,20 +1,21 @@
-"""The groups of a stored plan: what each is conditioned on, what the network is given, and which views it makes."""
+"""The groups of a stored plan as a generator is given them: latents, cameras and noise from the store."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
+from cat3d_core.generation import Generator, ViewGroup
+from cat3d_core.plan import Group
 from cat3d_core.random import normal
-from cat3d_core.rays import raymap
 from cat3d_core.sample_sets import KINDS, sample_cameras
 from cat3d_core.view_selection import pose_distance
+from flows.generation.plan import read_plan
+from flows.generation.views import captured_sample
 from flows.jobs.access import read_cameras
 from schemas.content_key import content_key
 from schemas.scene_store import Run, SceneStore
@@ -23,52 +24,60 @@ from schemas.scene_store import Run, SceneStore
 CAPTURED_LATENTS = dict(zip(KINDS, ("captured", "captured_wide"), strict=True))
 
 
-@dataclass(frozen=True)
-class Group:
-    """Views sampled together: targets (n) planned views; conditions (m), below V a captured view, V + v planned view v.
-
-    kind: the sample set, "square" or "wide".
-    """
-
-    targets: list[int]
-    conditions: list[int]
-    kind: str
-
-
 class StoredPlan:
-    """The plan of a run as the sampler needs it, read once."""
+    """The plan of a run as the sampler needs it, read once; `plan` counts the store's captured views."""
 
     def __init__(self, store: SceneStore, run: Run, seed: int) -> None:
         self.store, self.run, self.seed = store, run, seed
-        section = run.plan
-        self.image_size = int(section.attrs["image_size"])
-        self.cameras = read_cameras(section)
         self.captured_count = store.captured.shape("size")[0]
-        self.captured = {
-            kind: sample_cameras(read_cameras(store.captured), kind, self.image_size) for kind in section.attrs["kinds"]
-        }
-        self.groups = _groups(
-            section.read("group_views"),
-            section.read("group_valid"),
-            section.read("condition"),
-            section.read("sample_kind"),
-        )
-        self.anchor: NDArray[np.bool_] = section.read("anchor")
-        self.needed = bool(section.attrs["needed"])
+        self.plan = read_plan(run.plan, self.captured_count)
+        size = int(self.plan.cameras.size[0, 0])
+        kinds = dict.fromkeys(group.kind for group in self.groups)
+        self.captured = {kind: sample_cameras(read_cameras(store.captured), kind, size) for kind in kinds}
 
     def __len__(self) -> int:
-        return len(self.cameras)
+        return len(self.plan)
+
+    @property
+    def groups(self) -> tuple[Group, ...]:
+        return self.plan.groups
+
+    @property
+    def cameras(self) -> Cameras:
+        return self.plan.cameras
+
+    @property
+    def needed(self) -> bool:
+        return self.plan.needed
 
     def passes(self) -> list[list[int]]:
-        """Numbers of the groups that can be sampled at the same time: those of anchors, then the others; none where
-        nothing need be generated."""
-        if not self.needed:
-            return []
-        first = [g for g, group in enumerate(self.groups) if self.anchor[group.targets[0]]]
-        return [p for p in (first, sorted(set(range(len(self.groups))) - set(first))) if p]
+        """Numbers of the groups that can be sampled at the same time (see `Plan.passes`)."""
+        return self.plan.passes()
+
+    def view_group(self, group: Group, generator: Generator) -> ViewGroup:
+        """What a generator is given to sample a group: latents as stored, of anchors never decoded between."""
+        given = [self._camera(view, group.kind) for view in group.conditions]
+        latents = self.condition_latents(group)
+        return ViewGroup(
+            latents=latents,
+            cameras=Cameras.cat([*given, self.cameras[group.targets]]),
+            noise=self.noise(group, generator.spec.latent_shape),
+            images=self._images(group, latents, generator) if "images" in generator.spec.wants else None,
+            scene=self.captured[group.kind],
+        )
+
+    def _images(self, group: Group, latents: Tensor, generator: Generator) -> Tensor:
+        """(M, 3, H, W) in [0, 1]: captured views as they were encoded, anchors decoded."""
+        images = []
+        for view, latent in zip(group.conditions, latents, strict=True):
+            if view < self.captured_count:
+                images.append(captured_sample(self.store, view, group.kind, generator.spec.image_size[0]))
+            else:
+                images.append(generator.decode(latent[None])[0])
+        return torch.stack(images)
 
     def condition_latents(self, group: Group) -> Tensor:
-        """(M, C, h, w) float32, as stored: encoded captured views and the latents of anchors, never decoded between."""
+        """(M, C, h, w) float32: encoded captured views and the latents of anchors."""
         rows = []
         for view in group.conditions:
             if view < self.captured_count:
@@ -76,12 +85,6 @@ class StoredPlan:
             else:
                 rows.append(self.run.generated.read("latent", [view - self.captured_count])[0])
         return torch.from_numpy(np.stack(rows)).float()
-
-    def raymaps(self, group: Group, latent_size: int) -> Tensor:
-        """(M + N, 6, h, w) float32: rays of the conditioning views, then of the targets, in the frame of the first."""
-        cameras = [self._camera(view, group.kind) for view in group.conditions]
-        together = Cameras.cat([*cameras, self.cameras[group.targets]])
-        return raymap(together, together.world_from_camera[0], latent_size, latent_size).float()
 
     def noise(self, group: Group, shape: tuple[int, int, int]) -> Tensor:
         """(N, C, h, w): each view's own numbers, whatever group, batch or worker it is in."""
@@ -105,14 +108,3 @@ class StoredPlan:
 def view_keys(step_key: str, views: int) -> list[str]:
     """The content key of each generated view: of everything its stage's key covers, and its number."""
     return [content_key(step=step_key, view=view) for view in range(views)]
-
-
-def _groups(
-    views: NDArray[np.int32], valid: NDArray[np.bool_], condition: NDArray[np.int32], kind: NDArray[np.uint8]
-) -> list[Group]:
-    groups = []
-    for row, kept in zip(views, valid, strict=True):
-        targets = row[kept].tolist()
-        conditions = condition[targets[0]]
-        groups.append(Group(targets, conditions[conditions >= 0].tolist(), KINDS[int(kind[targets[0]])]))
-    return groups

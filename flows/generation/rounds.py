@@ -20,11 +20,12 @@ from cat3d_core.uncertainty import unseen
 from cat3d_core.view_selection import pose_distance
 from flows.generation.brief import brief_reconstruction, brief_render
 from flows.generation.groups import StoredPlan
-from flows.generation.model import shared_model
+from flows.generation.hints import explained_views
+from flows.generation.open import open_generator
+from flows.generation.views import finished, in_window
 from flows.jobs.access import read_cameras, read_images, views_with_role
 from flows.jobs.job import Job
-from flows.media.images import resize
-from flows.stages.decode import decoded
+from flows.media.images import resize, to_uint8
 from schemas.decisions import chosen as decided
 from schemas.decisions import skipped
 from schemas.scene_store import SceneStore
@@ -109,13 +110,12 @@ class Rounds(OneRound):
         shown = [v for v in self.train if v != self.held_out]
         cameras, images = read_cameras(self.store.captured, shown), read_images(self.store.captured, shown)
         run = self.store.run(self.job.run)
-        model = shared_model(self.job)
-        windows = run.plan.read("window")
+        generator, explained = open_generator(self.job), explained_views(run)
+        windows = self.plan.plan.window.tolist()
         for view in (v for g in groups for v in self.plan.groups[g].targets):
-            x0, y0, width, height = windows[view].tolist()
-            image = decoded(model, run.generated, view)[0, y0 : y0 + height, x0 : x0 + width]
-            cameras = Cameras.cat([cameras, self.plan.cameras[view].crop(x0, y0, width, height)])
-            images.append(torch.from_numpy(np.ascontiguousarray(image)))
+            made = to_uint8(finished(self.job, generator, run, view, bool(explained[view]))[0])
+            camera, image = in_window(self.plan.cameras[view], made, windows[view])
+            cameras, images = Cameras.cat([cameras, camera]), [*images, image]
         return Views.from_images(cameras, images, torch.arange(len(cameras)) < len(shown))
 
     def brief(self, groups: list[int]) -> Reconstructor:

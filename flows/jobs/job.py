@@ -53,6 +53,13 @@ class Job(BaseModel):
         return self.config.generate != "never"
 
     @property
+    def hinted(self) -> bool:
+        """Whether what photos show is carried into generated views: with the shipped model, or where asked for."""
+        hints, sample = self.config.hints, self.config.sample
+        shipped = sample.checkpoint is None and sample.generator is None
+        return self.generates and (hints.use == "always" or (hints.use == "auto" and shipped))
+
+    @property
     def run(self) -> str:
         """Name of the run inside the store, e.g. "v3-zipnerf"; seeds other than 0 are named too."""
         seed = f"-s{self.config.seed}" if self.config.seed else ""

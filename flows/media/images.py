@@ -158,9 +158,8 @@ def undistort(
     new[0, 0], new[1, 1] = intrinsics[[0, 1], [0, 1]] * filling_zoom(intrinsics, distortion, width, height)
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     source = distorted_pixels(torch.stack([columns, rows], -1).double(), new, intrinsics, distortion)
-    grid = (
-        2 * source / torch.tensor([width, height]) - 1
-    ).float()  # grid_sample without align_corners: -1..1 is the area
+    # In grid_sample without align_corners -1 to 1 is the area of the image.
+    grid = (2 * source / torch.tensor([width, height]) - 1).float()
     mode = "nearest" if nearest else "bicubic"
     out = F.grid_sample(_planes(image), grid[None], mode=mode, padding_mode="border", align_corners=False)
     return _from_planes(out, image.ndim), new
@@ -172,7 +171,7 @@ def write_png(path: Path | str, image: np.ndarray | Tensor) -> None:
 
 
 def write_jpeg(path: Path | str, image: np.ndarray | Tensor, quality: int = 93) -> None:
-    """As `write_png`, in JPEG (no alpha, 4:4:4)."""
+    """Write an image as JPEG, without alpha or chroma subsampling (4:4:4); otherwise like `write_png`."""
     _write(Path(path), to_uint8(image), {"Compression": f"jpeg:{quality}", "jpeg:subsampling": "4:4:4"})
 
 

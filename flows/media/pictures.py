@@ -22,6 +22,16 @@ def depth_picture(depth: np.ndarray, near: float | None = None, far: float | Non
     return (colormaps["turbo"](share)[..., :3] * 255 + 0.5).astype(np.uint8)
 
 
+def share_picture(values: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 of values (H, W) from 0, dark, to 1 or the largest where that is more, bright."""
+    from matplotlib import colormaps
+
+    finite = np.nan_to_num(values.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    return (colormaps["viridis"](np.clip(finite / max(1.0, float(finite.max())), 0, 1))[..., :3] * 255 + 0.5).astype(
+        np.uint8
+    )
+
+
 def error_picture(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """(H, W, 3) uint8: the mean absolute difference over channels, black at 0, white at a quarter of the range."""
     from matplotlib import colormaps

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.plan import Plan
+from cat3d_core.trajectories import SceneFrame
 
 _CAPTURED, _ANCHOR, _POINTS = "#d62728", "#ff7f0e", "#bbbbbb"
 _MAX_POINTS = 4000
@@ -27,13 +28,16 @@ def draw_plan(captured: Cameras, plan: Plan, points: torch.Tensor | None = None,
     """PNG of the plan from above and from the side, in the scene's upright axes and units of its distance.
 
     Captured views red, anchors orange, the others coloured by index; a line shows each viewing direction. points
-    (P, 3): scene points, drawn grey. The figure of the paper's appendix has the same colours.
+    (P, 3): scene points, drawn grey. The figure of the paper's appendix has the same colours. Raises ValueError for a
+    stored plan that has lost its frame.
     """
+    if (frame := plan.frame) is None:
+        raise ValueError("This plan was stored without the scene's axes, by an older program: plan the scene again.")
     figure = Figure(figsize=(13, 6.2), layout="constrained")
     FigureCanvasAgg(figure)
-    planned = _local(plan, plan.cameras)
-    sources = _local(plan, captured)
-    cloud = _some_points(plan, points)
+    planned = _local(frame, plan.cameras)
+    sources = _local(frame, captured)
+    cloud = _some_points(frame, points)
     anchor = plan.anchor.numpy()
     index = np.arange(len(plan))
     for axes, (name, (a, b), labels) in zip(figure.subplots(1, 2), _VIEWS, strict=True):
@@ -65,7 +69,7 @@ def plan_table(plan: Plan, names: Sequence[str] | None = None, rows: int = 24) -
     """
     before, after = plan.captured_coverage, plan.plan_coverage
     table = Table(
-        title=f"{plan.recipe}: {len(plan)} views in {len(plan.group_views)} groups",
+        title=f"{plan.recipe}: {len(plan)} views in {len(plan.groups)} groups",
         caption="\n".join(
             [
                 *plan.reasons,
@@ -75,26 +79,23 @@ def plan_table(plan: Plan, names: Sequence[str] | None = None, rows: int = 24) -
         ),
         caption_justify="left",
     )
-    for column in ("group", "kind", "path", "views", "padded", "conditioned on"):
+    for column in ("group", "kind", "path", "views", "conditioned on"):
         table.add_column(column)
-    count = len(plan.group_views)
+    count = len(plan.groups)
     shown = range(count) if count <= rows else [*range(rows - rows // 3), *range(count - rows // 3, count)]
     previous = -1
     for g in shown:
         if g != previous + 1:
             table.add_row("...")
         previous = g
-        views = plan.group_views[g][plan.group_valid[g]].tolist()
-        first = views[0]
-        kind = "anchors" if plan.anchor[first] else ("square", "wide")[int(plan.sample_kind[first])]
-        path = sorted({int(plan.path[v]) for v in views})
+        group = plan.groups[g]
+        path = sorted({int(plan.path[v]) for v in group.targets})
         table.add_row(
             str(g),
-            kind,
+            "anchors" if group.anchors else group.kind,
             ", ".join(map(str, path)),
-            _ranges(views),
-            str(int(plan.group_targets[g]) - len(views) or ""),
-            ", ".join(_source(plan, c, names) for c in plan.condition[first].tolist() if c >= 0),
+            _ranges(group.targets),
+            ", ".join(_source(plan, condition, names) for condition in group.conditions),
         )
     return table
 
@@ -105,23 +106,23 @@ def _source(plan: Plan, condition: int, names: Sequence[str] | None) -> str:
     return names[condition] if names is not None else f"captured {condition}"
 
 
-def _ranges(views: list[int]) -> str:
-    if len(views) > 1 and views == list(range(views[0], views[-1] + 1)):
+def _ranges(views: Sequence[int]) -> str:
+    if len(views) > 1 and list(views) == list(range(views[0], views[-1] + 1)):
         return f"{views[0]}-{views[-1]}"
     return ", ".join(map(str, views))
 
 
-def _local(plan: Plan, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
+def _local(frame: SceneFrame, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
     """Centres and viewing directions in the scene's right, ahead, up axes."""
     cameras = cameras.to(device="cpu", dtype=torch.float64)
-    return plan.frame.local(cameras.centers).numpy(), (cameras.forward @ plan.frame.axes.T).numpy()
+    return frame.local(cameras.centers).numpy(), (cameras.forward @ frame.axes.T).numpy()
 
 
-def _some_points(plan: Plan, points: torch.Tensor | None) -> np.ndarray:
+def _some_points(frame: SceneFrame, points: torch.Tensor | None) -> np.ndarray:
     if points is None or len(points) == 0:
         return np.zeros((0, 3))
     stride = max(1, len(points) // _MAX_POINTS)
-    return plan.frame.local(points[::stride].to(device="cpu", dtype=torch.float64)).numpy()
+    return frame.local(points[::stride].to(device="cpu", dtype=torch.float64)).numpy()
 
 
 def _directions(axes, center: np.ndarray, toward: np.ndarray, columns: tuple[int, int], color: str, length: float):  # type: ignore[no-untyped-def]  # noqa: E501

@@ -1,7 +1,7 @@
 """What `cat3d inspect STORE` tells: the tree, how complete each stage is, the cameras, what is stale, what is damaged.
 
-`inspect_store` gives a dictionary for machines, `as_text` the same for people. Reading only; a store may be written
-meanwhile, and then what is seen is a moment of it.
+`inspect_store` gives a dictionary for machines; `inspect_text.py` prints it for people. Reading only; a store may be
+written meanwhile, and then what is seen is a moment of it.
 """
 
 from __future__ import annotations
@@ -14,10 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Group, RenderableType
-from rich.markup import escape
-from rich.table import Column, Table
-from rich.text import Text
 
 from flows.stages import STAGES
 from schemas import arrays
@@ -174,69 +170,6 @@ def camera_summary(section: Section) -> dict[str, Any] | None:
     }
 
 
-def as_text(report: Mapping[str, Any]) -> RenderableType:
-    """The report of `inspect_store` as something rich prints."""
-    head = Text(
-        f"{report['path']}\nscene {report['scene_id']} of {report['dataset']}, schema {report['schema_version']}, "
-        f"{_bytes(report['bytes_stored'])} stored of {_bytes(report['bytes'])}"
-    )
-    parts: list[RenderableType] = [head, _array_table(report["arrays"]), _stage_table(report["stages"])]
-    parts += [Text(_camera_line(name, summary)) for name, summary in report["cameras"].items()]
-    parts += [Text(f"{p['kind']}: {p['message']}", style="red") for p in report["problems"]]
-    if report["verified"]:
-        count = sum(row.get("chunks_stored", 0) for row in report["arrays"])
-        parts.append(Text(f"Every chunk was read ({count}): {'all good' if report['ok'] else 'damage was found'}."))
-    return Group(*parts)
-
-
-def _array_table(rows: list[dict[str, Any]]) -> Table:
-    table = Table(Column("array", no_wrap=True), "shape", "dtype", "chunk", "chunks", "stored", "ratio", "codecs")
-    table.box, table.pad_edge = None, False
-    section = None
-    for row in rows:
-        above, _, name = row["path"].rpartition("/")
-        if above != section:
-            section = above
-            table.add_row(f"{above}/")
-        name = f"  {name}"
-        if "error" in row:
-            table.add_row(name, f"[red]{escape(row['error'])}")
-            continue
-        there = f"{row['chunks_stored']}/{row['chunks_total']}"
-        ratio = "" if row["compression_ratio"] is None else f"{row['compression_ratio']:.2f}"
-        shape, chunk = ("x".join(map(str, row[name])) for name in ("shape", "chunks"))
-        stored = _bytes(row["bytes_stored"])
-        table.add_row(name, shape, row["dtype"], chunk, there, stored, ratio, " ".join(row["codecs"]))
-    return table
-
-
-def _stage_table(rows: list[dict[str, Any]]) -> Table:
-    table = Table("run", "stage", "state", "views", "seconds", "finished", "key", box=None, pad_edge=False)
-    for row in rows:
-        state = "damaged record" if "error" in row else "complete" if row["complete"] else "not complete"
-        if row["stale_because"]:
-            state = f"stale: {row['stale_because']}"
-        views = f"{row['views_done']}/{row['views_total']}" if "views_done" in row else ""
-        seconds = f"{row['seconds']:.1f}" if row["complete"] else ""
-        finished = row.get("finished_at", "")[:19]
-        table.add_row(row["run"] or "", row["stage"], state, views, seconds, finished, row.get("key", "")[:12])
-    return table
-
-
-def _camera_line(name: str, summary: Mapping[str, Any]) -> str:
-    if "error" in summary:
-        return f"cameras of {name}: {summary['error']}"
-    if not summary["count"]:
-        return f"cameras of {name}: none"
-    sizes = ", ".join(f"{n} of {size}" for size, n in summary["sizes"].items())
-    span = [high - low for low, high in zip(summary["extent_min"], summary["extent_max"], strict=True)]
-    return (
-        f"cameras of {name}: {sizes} px; focal length {_span(summary['focal_px'])} px, horizontal field of view "
-        f"{_span(summary['fov_degrees']['horizontal'])} degrees; centres span "
-        f"{' x '.join(f'{s:.3g}' for s in span)} scene units, farthest apart {summary['baseline_largest']:.3g}"
-    )
-
-
 def _camera_sections(store: SceneStore) -> list[tuple[str | None, Section]]:
     plans = [(f"{run}/plan", Section(store.root, f"runs/{run}/plan", False)) for run in store.runs()]
     return [(None, store.captured), *plans]
@@ -276,15 +209,3 @@ def _codec(codec: Any) -> str:
 
 def _range(values: NDArray[Any]) -> list[float]:
     return [float(values.min()), float(values.max())]
-
-
-def _span(limits: list[float]) -> str:
-    low, high = limits
-    return f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.4g} to {high:.4g}"
-
-
-def _bytes(count: int) -> str:
-    for unit, factor in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
-        if count >= factor:
-            return f"{count / factor:.1f} {unit}"
-    return f"{count} B"

@@ -17,7 +17,9 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, select_autoescape
 
+from flows.jobs.metric_table import metric_table
 from flows.media.pictures import depth_picture, error_picture
+from flows.reporting.answer import answers, best_runs, rivals
 from flows.reporting.charts import Point, Series, chart
 from flows.reporting.summary import (
     markdown,
@@ -41,6 +43,8 @@ from schemas.tables import TIMINGS, read_rows
 
 #: Held-out views shown of each run: all of a few, else this many.
 VIEWS_SHOWN = 3
+#: Scenes whose pictures stand at the top of the page, at most.
+SCENES_ON_TOP = 12
 SWEEP, PROBLEMS = "sweep.json", "problems.json"
 
 
@@ -59,6 +63,9 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
     published = any(e["published"] for t in tables for d in t["datasets"] for e in d["rows"])
     context = {
         "title": sweep.get("name", out.name),
+        "answers": answers(rows),
+        "rivals": rivals(rows),
+        "gallery": gallery(scenes, rows),
         "note": sweep.get("note", ""),
         "problems": _document(out / PROBLEMS) or [],
         "rows": rows,
@@ -84,6 +91,21 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
     return page
 
 
+def gallery(scenes: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The first held-out view of each scene, of its best run in the split with the fewest photos: what the page shows
+    before its tables. Each: the scene, the run, the view's number among those shown, and the run beside it or None."""
+    splits = sorted({r["split"] for r in rows}, key=split_order)
+    best, beside = (best_runs(rows, splits[0]) if splits else {}), rivals(rows)
+    out = []
+    for scene in scenes[:SCENES_ON_TOP]:
+        name = best.get(scene["id"])
+        shown = {run["name"] for run in scene["runs"] if run["views"]}
+        if name is not None and name in shown:
+            rival = beside.get((scene["id"], name))
+            out.append({"scene": scene["id"], "run": name, "rival": rival if rival in shown else None})
+    return out
+
+
 def _document(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
@@ -92,6 +114,8 @@ def scene_section(out: Path, path: Path) -> dict[str, Any]:
     """What the page shows of one scene: pictures of some held-out views per run, decisions, versions."""
     store = SceneStore.open(path)
     truths: dict[int, np.ndarray] = {}
+    measured = read_rows(out / "metrics", metric_table()).to_pylist()
+    psnr = {(r["run"], r["view"]): r["psnr_db"] for r in reversed(measured) if r["scene_id"] == store.scene_id}
     runs = []
     for name in sorted(store.runs(), key=_run_order):
         run = store.run(name)
@@ -100,7 +124,7 @@ def scene_section(out: Path, path: Path) -> dict[str, Any]:
         runs.append(
             {
                 "name": name,
-                "views": view_pictures(store, run, truths) if "render" in records else [],
+                "views": view_pictures(store, run, truths, psnr) if "render" in records else [],
                 "decisions": {stage: record.decisions for stage, record in records.items() if record.decisions},
                 "codes": {stage: record.code_version for stage, record in records.items()},
                 "model": records["sample"].inputs.get("model", "") if "sample" in records else "",
@@ -132,8 +156,11 @@ def _run_order(name: str) -> tuple:
     return split_order(split), method_order(method)
 
 
-def view_pictures(store: SceneStore, run: Run, truths: dict[int, np.ndarray]) -> list[dict[str, Any]]:
-    """Truth, render, error and depth of up to VIEWS_SHOWN held-out views, as data URIs. truths: photos read so far."""
+def view_pictures(
+    store: SceneStore, run: Run, truths: dict[int, np.ndarray], psnr: dict[tuple[str, int], float | None]
+) -> list[dict[str, Any]]:
+    """Truth, render, error and depth of up to VIEWS_SHOWN held-out views, as data URIs. truths: photos read so far;
+    psnr: in dB, by run and view."""
     if "test" not in run.section("renders"):
         return []
     section = run.renders("test")
@@ -148,6 +175,7 @@ def view_pictures(store: SceneStore, run: Run, truths: dict[int, np.ndarray]) ->
         out.append(
             {
                 "name": str(names[view]),
+                "psnr": psnr.get((run.name, view)),
                 "truth": png_uri(truth),
                 "render": png_uri(image),
                 "error": png_uri(error_picture(image, truth)),

@@ -43,7 +43,9 @@ def load_bank(folder: Path, image_size: int) -> LatentBank:
     return LatentBank(**{name: torch.cat([p[name] for p in parts]) for name in parts[0]}, image_size=image_size)
 
 
-def jitter_scale(raymaps: Tensor, most: float, random: torch.Generator) -> Tensor:
-    """Scale each group's ray origins (raymaps [G, V, 6, h, w]) by a number from 1 / most to most."""
-    factor = most ** (2 * torch.rand(len(raymaps), 1, 1, 1, 1, generator=random) - 1)
-    return torch.cat([raymaps[:, :, :3] * factor, raymaps[:, :, 3:]], 2)
+def jitter_scale(cameras: Tensor, most: float, random: torch.Generator) -> Tensor:
+    """Scale the positions of each group's cameras [G, V, 4, 4] by a number from 1 / most to most."""
+    factor = most ** (2 * torch.rand(len(cameras), 1, 1, generator=random) - 1)
+    scaled = cameras.clone()
+    scaled[:, :, :3, 3] *= factor
+    return scaled

@@ -19,6 +19,7 @@ from cat3d_core.diffusion import (
     save_state,
 )  # fmt: skip
 from cat3d_core.diffusion.training import half_cosine
+from cat3d_core.generation import Cat3dGenerator
 from cat3d_core.random import generator
 from flows.progress import meter
 from flows.training.bank import jitter_scale
@@ -76,12 +77,12 @@ def optimizer_step(
     losses, record, views = [], {}, config.model.views
     for _ in range(config.optimizer.accumulate):
         key = (trainer.calls, ranks.rank)
-        latents, rays = bank.batch(
+        latents, cameras = bank.batch(
             config.optimizer.groups, views, config.seed, *key, spread=spread_at(config, done)
         )  # fmt: skip
-        rays = jitter_scale(rays, config.scale_jitter, generator(config.seed, "jitter", *key))
+        cameras = jitter_scale(cameras, config.scale_jitter, generator(config.seed, "jitter", *key))
         modes = config.conditions if done >= config.joint_from else config.conditions[:1]
-        record = trainer.step(latents, rays, modes[trainer.calls % len(modes)])
+        record = trainer.step(latents, cameras, modes[trainer.calls % len(modes)])
         losses.append(record["loss"])
     return record | {"loss": sum(losses) / len(losses)}
 
@@ -183,6 +184,7 @@ def write_samples(config: TrainRunConfig, folder: Path, trainer: Trainer, scenes
     name, given = f"step_{trainer.steps:08d}", max(config.conditions)
     if (folder / SHEETS / f"{name}.png").exists():
         return
-    images = sampled(trainer.ema_model().to(trainer.device), scenes, given, config.sample_steps)
+    generator = Cat3dGenerator(trainer.ema_model().to(trainer.device))
+    images = sampled(generator, scenes, given, config.sample_steps)
     append_rows(folder / SHEETS, SAMPLES, scores(images, scenes, given, trainer.steps), name)
     write_sheet(folder / SHEETS / f"{name}.png", images, scenes, given)

@@ -8,9 +8,10 @@ from typing import Any
 
 import torch
 
-from cat3d_core.diffusion import SIZES, Autoencoder, ModelConfig, MultiViewModel, load_model
+from cat3d_core.diffusion import SIZES, Autoencoder, ModelConfig, MultiViewModel, describe, load_model
 from cat3d_core.diffusion.config import from_dict
 from cat3d_core.diffusion.pretrained import load_stable_diffusion
+from flows.generation.formats.cat3d import recognises
 
 
 def model_config(
@@ -36,7 +37,7 @@ def starting_config(config: ModelConfig, start: Path | None) -> ModelConfig:
     views. Raises ValueError for a model file of ours with another U-Net."""
     if start is None:
         return config
-    if _is_ours(start):
+    if recognises(start):
         theirs = load_model(start).config
         # These have no weights: a network may take up relative cameras or larger images in the middle of its training.
         free = {name: getattr(config.unet, name) for name in ("relative_cameras", "latent_size")}
@@ -54,7 +55,7 @@ def starting_model(config: ModelConfig, autoencoder: Autoencoder, start: Path | 
     if start is None:
         # No pretrained network has to be kept as it is: let the rays in from the first step.
         torch.nn.init.kaiming_uniform_(model.unet.conv_in.weight, a=5**0.5)
-    elif _is_ours(start):
+    elif recognises(start):
         model.unet.load_state_dict(load_model(start).unet.state_dict())
     else:
         model.unet = _from_stable_diffusion(start, config)[0]
@@ -63,25 +64,11 @@ def starting_model(config: ModelConfig, autoencoder: Autoencoder, start: Path | 
 
 def history(start: Path) -> dict[str, Any]:
     """What is to be remembered of the weights that a training starts from: which they are, and what they had seen."""
-    if not _is_ours(start):
+    if not recognises(start):
         return {"file": start.name}
-    from cat3d_core.diffusion import describe
-
     facts = describe(start)
     kept = ("steps", "groups_of_views", "groups_of_8_views", "hours", "started_from")
     return {"sha256": facts.get("sha256")} | {k: facts["provenance"][k] for k in kept if k in facts["provenance"]}
-
-
-def _is_ours(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    from cat3d_core.diffusion import describe
-
-    try:
-        describe(path)
-    except ValueError:
-        return False
-    return True
 
 
 def _from_stable_diffusion(path: Path, config: ModelConfig) -> Any:

@@ -25,6 +25,8 @@ from flows.training.autoencoder import (
 )
 from flows.training.bank import encode_shards, load_bank
 from flows.training.ranks import Ranks
+from flows.training.worlds.package import TRAINING
+from flows.training.worlds.shards import SHARD_GROUPS, shard_numbers, world_shards
 from schemas.errors import ConfigError
 from schemas.training import TrainRunConfig
 
@@ -36,7 +38,8 @@ def prepare(config: TrainRunConfig, network: ModelConfig, folder: Path, own: Ran
 
     Raises ConfigError for a bank that is too large, or a folder that holds another one."""
     bank, size, seed = config.bank, network.image_size, bank_seed(config)
-    needed = renders.bank_bytes(bank.scenes, bank.views, size, bank.variants, network.unet.latent_channels)
+    groups = bank.world_groups if bank.worlds else 0
+    needed = renders.bank_bytes(bank.scenes + groups, bank.views, size, bank.variants, network.unet.latent_channels)
     if needed > bank.max_gib * 2**30:
         raise ConfigError(
             f"The bank would take {needed / 2**30:.1f} GiB, more than bank.max_gib = {bank.max_gib:g} allows; ask for "
@@ -47,16 +50,23 @@ def prepare(config: TrainRunConfig, network: ModelConfig, folder: Path, own: Ran
         made |= {"network", "autoencoder"} if (folder / AUTOENCODER).exists() else set()
         claim(folder / "bank.json", _identity(config, network), made)
     own.barrier()
-    mine = renders.shard_numbers(bank.scenes)[own.rank :: own.world]
-    complete = len(renders.shards(folder, "latents")) == len(renders.shard_numbers(bank.scenes))
+    procedural = renders.shard_numbers(bank.scenes)
+    mine = procedural[own.rank :: own.world]
+    everything = range(len(procedural) + len(shard_numbers(groups)))
+    complete = len(renders.shards(folder, "latents")) == len(everything)
     photos = read_photos(bank.textures) if bank.textures and not complete else None
     scenes = sum(min(renders.SHARD_SCENES, bank.scenes - n * renders.SHARD_SCENES) for n in mine)
     with meter("render scenes", scenes) as bar:
         renders.render_shards(
             folder, bank.families, bank.scenes, bank.views, size, seed, photos, own.device, mine, bar.advance
         )
+    if bank.worlds:
+        turns = shard_numbers(groups)[own.rank :: own.world]
+        with meter("photograph worlds", SHARD_GROUPS * len(turns)) as bar:
+            world_shards(folder, bank.worlds, TRAINING, turns, bank.views, size, seed, bar.advance, len(procedural))
     own.barrier()
     autoencoder = get_autoencoder(config, network, folder, photos, own)
+    mine = everything[own.rank :: own.world]
     with meter("encode shards", len(mine)) as bar:
         encode_shards(folder, autoencoder, bank.variants, own.device, mine, bar.advance)
     own.barrier()
@@ -72,7 +82,8 @@ def bank_seed(config: TrainRunConfig) -> int:
 
 def _identity(config: TrainRunConfig, network: ModelConfig) -> dict[str, Any]:
     """What the contents of a bank depend on."""
-    bank = config.bank.model_dump(mode="json", exclude={"folder", "seed", "max_gib"})
+    without = set() if config.bank.worlds else {"world_groups"}
+    bank = config.bank.model_dump(mode="json", exclude={"folder", "seed", "max_gib", "worlds"} | without)
     network_document = json.loads(network.to_json())["autoencoder"]
     wanted = config.autoencoder.model_dump(mode="json")
     return {"bank": bank, "image_size": network.image_size, "seed": bank_seed(config), "network": network_document,

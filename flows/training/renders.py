@@ -53,8 +53,9 @@ def squares(images: Sequence[Tensor], side: int = 448) -> Tensor:
 
 
 def as_tensors(capture: Capture) -> dict[str, Tensor]:
-    """A capture as it is stored: image uint8, cameras float32."""
-    return {
+    """A capture as it is stored: image uint8, cameras float32, and inverse depth float16 if it has one."""
+    depth = {} if capture.inverse_depth is None else {"inverse_depth": capture.inverse_depth.half()}
+    return depth | {
         "image": (capture.image * 255).round().to(torch.uint8),
         "intrinsics": capture.cameras.intrinsics.float(),
         "world_from_camera": capture.cameras.world_from_camera.float(),
@@ -62,13 +63,14 @@ def as_tensors(capture: Capture) -> dict[str, Tensor]:
 
 
 def training_scene(
-    family: str, number: int, seed: int, views: int, size: int, textures: Tensor | None, device: torch.device | str
-) -> Capture:
+    family: str, number: int, seed: int, views: int, size: int, textures: Tensor | None,
+    device: torch.device | str, with_depth: bool = False,
+) -> Capture:  # fmt: skip
     """Training scene `number`. Raises ValueError where ten draws of it have no free place for cameras."""
     for attempt in range(ATTEMPTS):
         try:
             key = derive_seed(seed, "training scene", number, attempt) & 0x7FFFFFFF
-            return training_capture(family, key, views, size, textures, device)
+            return training_capture(family, key, views, size, textures, device, with_depth)
         except ValueError:  # no free place for the cameras: the next draw
             if attempt == ATTEMPTS - 1:
                 raise
@@ -86,6 +88,7 @@ def render_shards(
     device: torch.device | str,
     mine: Sequence[int],
     advance: Callable[[int], None],
+    with_depth: bool = False,
 ) -> None:
     """Render the shards `mine` that are not there yet, families in turn. `advance` is told of scenes done."""
     for shard in mine:
@@ -97,7 +100,7 @@ def render_shards(
         parts = []
         for number in numbers:
             family = families[number % len(families)]
-            parts.append(as_tensors(training_scene(family, number, seed, views, size, textures, device)))
+            parts.append(as_tensors(training_scene(family, number, seed, views, size, textures, device, with_depth)))
             advance(1)
         stacked = {name: torch.stack([p[name] for p in parts]) for name in parts[0]}
         stacked["family"] = torch.tensor([number % len(families) for number in numbers])

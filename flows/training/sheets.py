@@ -12,11 +12,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.diffusion import GuidanceConfig, MultiViewModel, SamplerConfig, sample
+from cat3d_core.diffusion import GuidanceConfig, SamplerConfig
+from cat3d_core.generation import Generator, generate
 from cat3d_core.metrics.psnr import psnr
 from cat3d_core.random import normal
-from cat3d_core.rays import raymap
-from flows.bench.model import camera_distance, held_out_group
+from cat3d_core.synthetic.held_out import held_out_group
+from cat3d_core.view_selection import camera_distance
 from flows.media.images import write_png
 
 
@@ -37,32 +38,15 @@ def held_out(families: Sequence[str], scenes: int, size: int, views: int) -> Hel
     return HeldOut(names, images, tuple(cameras for _, cameras in groups))
 
 
-@torch.no_grad()
-def sampled(model: MultiViewModel, scenes: HeldOut, given: int, steps: int) -> Tensor:
-    """Images (G, V - given, 3, H, W) of the target views, on the CPU, given the first `given`; noise keyed by group
-    and view.
+def sampled(generator: Generator, scenes: HeldOut, given: int, steps: int) -> Tensor:
+    """Images (G, V - given, 3, H, W) of the target views, given the first `given`; noise keyed by group and view.
 
     Targets beyond the model's group are sampled in further groups, so that models of other views can be compared."""
-    device = next(model.parameters()).device
-    latents = torch.stack([model.autoencoder.encode(images.to(device)) for images in scenes.images])
-    height, width = latents.shape[-2:]
-    rays = torch.stack([raymap(c, c.world_from_camera[0], height, width).float() for c in scenes.cameras])
-    noise = torch.stack(
-        [
-            torch.stack([normal(latents.shape[2:], 0, "sheet", group, view) for view in range(given, latents.shape[1])])
-            for group in range(len(latents))
-        ]
-    )
-    rays, noise = rays.to(device), noise.to(device)
-    config = SamplerConfig(steps=steps, guidance=GuidanceConfig(scale=1.0), micro_batch=min(len(latents), 8))
-    at_once = model.config.views - given
-    parts = []
-    for first in range(0, noise.shape[1], at_once):
-        targets = slice(given + first, given + first + at_once)
-        seen = torch.cat([rays[:, :given], rays[:, targets]], 1)
-        parts.append(sample(model, latents[:, :given], seen, noise[:, first : first + at_once], config))
-    out = torch.cat(parts, 1)
-    return torch.stack([model.autoencoder.decode(group) for group in out]).cpu()
+    sampler = SamplerConfig(steps=steps, guidance=GuidanceConfig(scale=1.0), micro_batch=min(len(scenes.images), 8))
+    shape = generator.spec.latent_shape
+    groups = [(images[:given], cameras) for images, cameras in zip(scenes.images, scenes.cameras, strict=True)]
+    made = generate(generator, groups, sampler, lambda group, view: normal(shape, 0, "sheet", group, view))
+    return torch.stack(made)
 
 
 def scores(images: Tensor, scenes: HeldOut, given: int, step: int) -> list[dict[str, Any]]:

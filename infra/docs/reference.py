@@ -15,6 +15,8 @@ from typing import Any, get_args
 import typer
 from pydantic import BaseModel
 
+from cat3d_core.metrics import measures
+from cat3d_core.metrics.protocols import PROTOCOLS
 from flows.cli import app
 from schemas.config import RunConfig, SweepConfig
 from schemas.layout import LAYOUT
@@ -87,8 +89,32 @@ def store() -> str:
     return "\n".join(lines) + "\n"
 
 
+def metrics() -> str:
+    """Every metric and what it needs, from `cat3d_core/metrics/measures.py`."""
+    lines = [NOTE.format(source="cat3d_core/metrics/measures.py"), "# Metrics", ""]
+    lines += wrapped(
+        "Measured of every held-out view; a row of `metrics/*.parquet` is one view under one protocol. A *protocol* "
+        "(`--set evaluate.protocols=[google]`) is the exact rules by which a published table measured: which window, "
+        "range, rounding and mask. The paper's is `google`. A column is empty where what it needs is lacking; nothing "
+        "is downloaded."
+    )
+    for metric in measures.METRICS:
+        better = f"{metric.better.capitalize()} is better."
+        unit = f" Unit: {metric.unit}." if metric.unit not in ("", "1") else ""
+        text = f"`{metric.name}`: {_sentence(metric.meaning)} {better}{unit}"
+        if metric.network is not None:
+            text += f" The column `{metric.network.column}` names the network. {metric.network.missing}"
+        lines += ["", f"## {metric.title}", "", *wrapped(text)]
+    lines += ["", "## Protocols", ""]
+    for name, protocol in PROTOCOLS.items():
+        lines += bullet(f"`{name}`: {_sentence(protocol.source)}")
+    return "\n".join(lines) + "\n"
+
+
 #: File name -> what writes it.
-PAGES: dict[str, Callable[[], str]] = {"commands.md": commands, "settings.md": settings, "store.md": store}
+PAGES: dict[str, Callable[[], str]] = {
+    "commands.md": commands, "settings.md": settings, "store.md": store, "metrics.md": metrics,
+}  # fmt: skip
 
 
 def stale() -> list[str]:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from flows.jobs.metric_table import metric_table
+from flows.reporting.answer import answers
 from flows.reporting.charts import Point, Series, chart, log_ticks, ticks
 from flows.reporting.published import PUBLISHED
 from flows.reporting.report import write_report
@@ -32,8 +33,14 @@ def test_page_shows_the_tables_numbers_and_needs_nothing_else(page: Path) -> Non
     text = page.read_text()
     row = summary_rows(page.parent)[0]
     assert f'<td class="first">{row["psnr_db"]:.2f}</td><td>{row["ssim"]:.3f}</td>' in text, "in the paper's layout"
-    assert f"<td>{row['psnr_db']:.2f}</td>" in text
-    assert f"<td>{row['ssim']:.3f}</td>" in text
+    link = f'<a href="#{row["scene_id"]}/{row["run"]}">'
+    assert f"<td>{link}{row['psnr_db']:.2f}</a>" in text, "one click from a number to its views"
+    assert f"<td>{link}{row['ssim']:.3f}</a>" in text
+    assert f'id="{row["scene_id"]}/{row["run"]}"' in text
+    assert answers(summary_rows(page.parent))[0].sentence in text, "the answer stands on the page"
+    assert text.index('class="answer"') < text.index('class="gallery"') < text.index("<table")
+    originals = set(re.findall(r'<img id="([^"]+)"', text))
+    assert set(re.findall(r'data-of="([^"]+)"', text)) <= originals, "every copy has its picture"
     loaded = re.findall(r'(?:src|href)="([^"]+)"', text)
     outside = [u for u in loaded if not u.startswith(("data:", "#")) and not (page.parent / u).exists()]
     assert not outside, outside
@@ -88,7 +95,7 @@ def test_an_identical_render_and_empty_columns_do_not_break_the_page(tmp_path: P
            "psnr_db": float("inf"), "ssim": 1.0, "dataset": "llff", "method": "zipnerf", "split": "3"}  # fmt: skip
     append_rows(tmp_path / "metrics", metric_table(), [row], "a")
     text = write_report(tmp_path).read_text()
-    assert "<td>inf</td>" in text
+    assert ">inf</a>" in text
     assert "| inf | 1.000 | - | - |" in (tmp_path / "report.md").read_text()
     assert [p for p in PUBLISHED if p["dataset"] == "llff" and p["method"] == "CAT3D" and p["split"] == "3"] == [
         {"dataset": "llff", "method": "CAT3D", "split": "3", "psnr_db": 21.58, "ssim": 0.731, "lpips": 0.181}

@@ -35,14 +35,21 @@ def random_model(seed: int = 0, **unet_changes: object) -> MultiViewModel:
     return model
 
 
+def matrices(groups: int, views: int, generator: torch.Generator) -> torch.Tensor:
+    """Random cameras [groups, views, 4, 4] as the network wants them: any plane of rays, none degenerate."""
+    out = torch.eye(4, dtype=torch.float64).repeat(groups, views, 1, 1)
+    out[:, :, :3] += 0.5 * torch.rand(groups, views, 3, 4, generator=generator, dtype=torch.float64) - 0.25
+    return out
+
+
 def inputs(groups: int, views: int, given: int, seed: int = 0) -> tuple[torch.Tensor, ...]:
-    """latents [G, V, 8, 8, 8], time [G], raymaps [G, V, 6, 8, 8], mask [G, V]."""
+    """latents [G, V, 8, 8, 8], time [G], cameras [G, V, 4, 4], mask [G, V]."""
     g = torch.Generator().manual_seed(seed)
     mask = torch.zeros(groups, views)
     mask[:, :given] = 1
     return (
         torch.randn(groups, views, 8, 8, 8, generator=g),
         torch.rand(groups, generator=g) * 999,
-        torch.randn(groups, views, 6, 8, 8, generator=g),
+        matrices(groups, views, g),
         mask,
     )

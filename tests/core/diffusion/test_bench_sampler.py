@@ -35,7 +35,7 @@ def test_prediction_is_the_posterior_mean(network, given):
     x = torch.randn(1, 4, generator=g, dtype=torch.float64)
     latents = torch.cat([torch.zeros(1, 1, 2, 1, 1), x.reshape(1, 2, 2, 1, 1)], 1)
     mask = torch.tensor([[float(given), 0, 0]])
-    v = network.double()(latents, time, torch.zeros(1, 3, 6, 1, 1), mask)[:, 1:].flatten()
+    v = network.double()(latents, time, torch.zeros(1, 3, 4, 4), mask)[:, 1:].flatten()
     modes = network.means[: 3 if given else 9]
     samples = modes[torch.randint(len(modes), (400_000,), generator=g)]
     samples = samples + network.std * torch.randn(samples.shape, generator=g, dtype=torch.float64)

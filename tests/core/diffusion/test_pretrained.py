@@ -13,6 +13,7 @@ from safetensors.torch import load_file, save_file
 from cat3d_core.diffusion.foreign_autoencoders import load_autoencoder, load_taesd
 from cat3d_core.diffusion.pretrained import export_2d, inflate, load_stable_diffusion
 from cat3d_core.diffusion.unet import MultiViewUNet
+from tests.core.diffusion.models import matrices
 
 SD1 = {"attention_head_dim": 8, "use_linear_projection": False, "cross_attention_dim": 24}
 SD2 = {"attention_head_dim": [1, 2, 2], "use_linear_projection": True, "cross_attention_dim": 40}
@@ -38,9 +39,9 @@ def _compare(oracle, unet, token):
     g = torch.Generator().manual_seed(1)
     x, time = torch.randn(3, 4, 8, 8, generator=g), torch.tensor([3.0, 500.0, 998.0])
     expected = oracle(x, time, encoder_hidden_states=token.expand(3, 1, -1)).sample
-    rays, mask = torch.randn(3, 1, 6, 8, 8, generator=g), torch.ones(3, 1)
+    cameras, mask = matrices(3, 1, g), torch.ones(3, 1)
     with torch.no_grad():
-        got = unet.eval()(x[:, None], time, rays, mask)[:, 0]
+        got = unet.eval()(x[:, None], time, cameras, mask)[:, 0]
     # Two orders of summation in float32 through some 60 layers.
     torch.testing.assert_close(got, expected, rtol=0, atol=2e-5 * float(expected.abs().max()))
 

@@ -20,8 +20,8 @@ from cat3d_core.diffusion import (
     save_state,
 )
 from cat3d_core.diffusion.training import _snr_weight
-from cat3d_core.rays import raymap
-from tests.core.diffusion.models import random_model, tiny
+from cat3d_core.rays import matrix_rays, raymap
+from tests.core.diffusion.models import matrices, random_model, tiny
 from tests.core.diffusion.test_unet import _cameras
 
 CONFIG = TrainConfig(learning_rate=1e-3, warmup_steps=2, total_steps=20, precision="float32")
@@ -29,34 +29,34 @@ CONFIG = TrainConfig(learning_rate=1e-3, warmup_steps=2, total_steps=20, precisi
 
 def _batch(step: int, groups: int = 4) -> tuple[torch.Tensor, torch.Tensor]:
     g = torch.Generator().manual_seed(step)
-    return torch.randn(groups, 8, 8, 8, 8, generator=g).half(), torch.randn(groups, 8, 6, 8, 8, generator=g)
+    return torch.randn(groups, 8, 8, 8, 8, generator=g).half(), matrices(groups, 8, g)
 
 
 def test_loss_is_on_targets_only_with_clean_conditioning():
     model = random_model()
-    latents, raymaps = _batch(0)
+    latents, cameras = _batch(0)
     seen = {}
 
     class Spy(torch.nn.Module):
-        def forward(self, x, time, rays, mask):
-            seen.update(x=x, mask=mask, rays=rays)
+        def forward(self, x, time, cameras, mask):
+            seen.update(x=x, mask=mask, cameras=cameras)
             out = torch.zeros_like(x)
             out[:, :3] = 1e6  # whatever the network says about conditioning views does not count
             return out
 
     schedule = Schedule(model.config.schedule, 5)
     config = dataclasses.replace(CONFIG, drop_probability=0.0)
-    loss = diffusion_loss(Spy(), schedule, latents, raymaps, 3, torch.Generator().manual_seed(0), config)
+    loss = diffusion_loss(Spy(), schedule, latents, cameras, 3, torch.Generator().manual_seed(0), config)
     assert torch.equal(seen["x"][:, :3], latents[:, :3].float())
     assert seen["mask"].tolist() == [[1] * 3 + [0] * 5] * 4
     # A zero prediction of v leaves E[v^2] = alpha^2 + sigma^2 E[clean^2] = 1 for unit latents.
     assert loss.shape == (4,)
     assert abs(float(loss.mean()) - 1) < 0.1
     config = dataclasses.replace(CONFIG, drop_probability=1.0)
-    diffusion_loss(Spy(), schedule, latents, raymaps, 3, torch.Generator().manual_seed(0), config)
+    diffusion_loss(Spy(), schedule, latents, cameras, 3, torch.Generator().manual_seed(0), config)
     assert seen["x"][:, :3].abs().sum() == 0
     assert seen["mask"].sum() == 0
-    assert seen["rays"].abs().sum() == 0
+    assert seen["cameras"].abs().sum() == 0
 
 
 def test_min_snr_weights():
@@ -104,13 +104,13 @@ def test_it_learns_a_constant(precision):
     )
     trainer = Trainer(config, MultiViewModel(tiny()), 0)
     picture = torch.randn(1, 1, 8, 8, 8, generator=torch.Generator().manual_seed(9))
-    latents, raymaps = picture.expand(2, 8, 8, 8, 8), _batch(0, 2)[1]
-    losses = [trainer.step(latents, raymaps, 3)["loss"] for _ in range(40)]
+    latents, cameras = picture.expand(2, 8, 8, 8, 8), _batch(0, 2)[1]
+    losses = [trainer.step(latents, cameras, 3)["loss"] for _ in range(40)]
     assert sum(losses[:3]) / 3 > 0.8
     assert sum(losses[-10:]) / 10 < 0.5
     model, schedule = trainer.ema_model(), Schedule(trainer.model_config.schedule, 5)
     with torch.no_grad():
-        averaged = diffusion_loss(model.unet, schedule, latents, raymaps, 3, torch.Generator().manual_seed(1), config)
+        averaged = diffusion_loss(model.unet, schedule, latents, cameras, 3, torch.Generator().manual_seed(1), config)
     assert float(averaged.mean()) < 0.5
 
 
@@ -124,9 +124,9 @@ def test_learning_rate_rises_then_falls():
 
 def test_a_loss_that_is_not_finite_stops_the_training():
     trainer = Trainer(CONFIG, MultiViewModel(tiny()), 0)
-    latents, raymaps = _batch(0)
+    latents, cameras = _batch(0)
     with pytest.raises(FloatingPointError, match="learning rate"):
-        trainer.step(latents * math.inf, raymaps, 1)
+        trainer.step(latents * math.inf, cameras, 1)
     assert trainer.steps == 0
 
 
@@ -163,16 +163,15 @@ def _bank(scenes: int = 6, views: int = 12) -> LatentBank:
 
 def test_bank_draws_groups_of_one_scene_with_matching_rays():
     bank = _bank()
-    latents, raymaps = bank.batch(40, 5, 0, "step", 1)
+    latents, cameras = bank.batch(40, 5, 0, "step", 1)
     marks = latents[:, :, 0, 0, 0].long()
     scene, view = marks // 12, marks % 12
     assert (scene == scene[:, :1]).all()
     assert all(len(v.unique()) == 5 for v in view)
     assert 8 < (scene[:, 0] == 5).sum() < 32  # the small family as often as the big one
-    cameras = _cameras(12, int(scene[7, 0]))
-    chosen = cameras[view[7]]
-    expected = raymap(chosen, chosen.world_from_camera[0], 4, 4).float()
-    torch.testing.assert_close(raymaps[7], expected, rtol=0, atol=1e-6)
+    chosen = _cameras(12, int(scene[7, 0]))[view[7]]
+    expected = raymap(chosen, chosen.world_from_camera[0], 4, 4)
+    torch.testing.assert_close(matrix_rays(cameras[7], 4, 4), expected, rtol=0, atol=1e-12)
     again, _ = bank.batch(40, 5, 0, "step", 1)
     other, _ = bank.batch(40, 5, 0, "step", 2)
     assert torch.equal(again, latents)
@@ -184,8 +183,8 @@ def test_bank_spread_limits_the_distance():
     bank = LatentBank(bank.latents, bank.intrinsics, bank.world_from_camera, torch.tensor([0, 1]), 64)
 
     def width(spread: float) -> float:
-        _, raymaps = bank.batch(60, 4, 0, 1, spread=spread)
-        return float(raymaps[:, 1:, :3, 0, 0].norm(dim=-1).mean())
+        _, cameras = bank.batch(60, 4, 0, 1, spread=spread)
+        return float(cameras[:, 1:, :3, 3].norm(dim=-1).mean())
 
     assert width(0.35) < width(1.0)
 

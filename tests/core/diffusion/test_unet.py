@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from cat3d_core.cameras import Cameras
 from cat3d_core.diffusion import SIZES, MultiViewUNet, count_flops, count_parameters
 from cat3d_core.diffusion.attention import Attention, ViewFrames, fold_views, unfold_views
-from cat3d_core.diffusion.conditioning import camera_vectors, relative_raymaps, view_matrices
-from cat3d_core.rays import raymap
+from cat3d_core.diffusion.conditioning import camera_vectors, view_matrices
+from cat3d_core.rays import matrix_rays, raymap, reference_from_image
 from tests.core.diffusion.models import inputs, random_model, randomized, tiny
 
 VARIANTS = [
@@ -45,24 +45,24 @@ def test_one_view_is_the_2d_network(changes):
                 parameter.zero_()
     flat = MultiViewUNet(tiny(**{**changes, "view_attention": "none"}).unet).eval()
     flat.load_state_dict(joint.state_dict(), strict=False)
-    latents, time, raymaps, mask = inputs(6, 1, 0)
+    latents, time, cameras, mask = inputs(6, 1, 0)
     with torch.no_grad():
-        expected = flat(latents, time, raymaps, mask)
-        torch.testing.assert_close(joint(latents, time, raymaps, mask), expected, rtol=0, atol=1e-5)
+        expected = flat(latents, time, cameras, mask)
+        torch.testing.assert_close(joint(latents, time, cameras, mask), expected, rtol=0, atol=1e-5)
         # And in a 2D network the views of a group are on their own.
-        together = flat(latents.reshape(2, 3, 8, 8, 8), time[:2], raymaps.reshape(2, 3, 6, 8, 8), mask.reshape(2, 3))
-        alone = flat(latents, time[:2].repeat_interleave(3), raymaps, mask)
+        together = flat(latents.reshape(2, 3, 8, 8, 8), time[:2], cameras.reshape(2, 3, 4, 4), mask.reshape(2, 3))
+        alone = flat(latents, time[:2].repeat_interleave(3), cameras, mask)
     torch.testing.assert_close(together.flatten(0, 1), alone.flatten(0, 1), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("changes", [*VARIANTS, {"relative_cameras": True}])
 def test_permuting_views_permutes_outputs(changes):
     unet = random_model(**changes).unet
-    latents, time, raymaps, mask = inputs(2, 5, 2)
+    latents, time, cameras, mask = inputs(2, 5, 2)
     order = torch.tensor([0, 1, 4, 2, 3])
     with torch.no_grad():
-        expected = unet(latents, time, raymaps, mask)[:, order]
-        got = unet(latents[:, order], time, raymaps[:, order], mask[:, order])
+        expected = unet(latents, time, cameras, mask)[:, order]
+        got = unet(latents[:, order], time, cameras[:, order], mask[:, order])
     torch.testing.assert_close(got, expected, rtol=0, atol=2e-5)
 
 
@@ -70,9 +70,9 @@ def test_permuting_views_permutes_outputs(changes):
 def test_groups_never_mix_and_views_do(changes):
     """The gradient of one group's output reaches no other group, and every view of its own."""
     unet = random_model(**changes).unet
-    latents, time, raymaps, mask = inputs(3, 4, 1)
+    latents, time, cameras, mask = inputs(3, 4, 1)
     latents.requires_grad_()
-    unet(latents, time, raymaps, mask)[1, 2].sum().backward()
+    unet(latents, time, cameras, mask)[1, 2].sum().backward()
     reach = latents.grad.abs().amax((2, 3, 4)) > 0
     assert not reach[[0, 2]].any()
     assert reach[1].all()
@@ -81,11 +81,11 @@ def test_groups_never_mix_and_views_do(changes):
 @pytest.mark.parametrize("changes", [{}, {"decoder_only": True}])
 def test_rays_and_mask_have_no_effect_at_initialisation(changes):
     unet = randomized(MultiViewUNet(tiny(**changes).unet), new_channels=False)
-    latents, time, raymaps, mask = inputs(2, 4, 1)
+    latents, time, cameras, mask = inputs(2, 4, 1)
     with torch.no_grad():
-        plain = unet(latents, time, torch.zeros_like(raymaps), torch.zeros_like(mask))
+        plain = unet(latents, time, torch.zeros_like(cameras), torch.zeros_like(mask))
         assert plain.abs().mean() > 0.01
-        assert torch.equal(unet(latents, time, raymaps, mask), plain)
+        assert torch.equal(unet(latents, time, cameras, mask), plain)
 
 
 def _cameras(count: int, seed: int) -> Cameras:
@@ -110,9 +110,9 @@ def test_rigid_motion_of_the_world_changes_nothing(seed):
     before = raymap(cameras, cameras.world_from_camera[0], 8, 8)
     after = raymap(moved, moved.world_from_camera[0], 8, 8)
     torch.testing.assert_close(after, before, rtol=0, atol=1e-12)
-    world = raymap(moved, torch.eye(4, dtype=torch.float64), 8, 8)
-    relative = relative_raymaps(world[None], moved.world_from_camera[:1])[0]
-    torch.testing.assert_close(relative, before, rtol=0, atol=1e-12)
+    matrices = [reference_from_image(c, c.world_from_camera[0]) for c in (cameras, moved)]
+    torch.testing.assert_close(matrices[1], matrices[0], rtol=0, atol=1e-12)
+    torch.testing.assert_close(matrix_rays(matrices[1], 8, 8), before, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("changes", [{}, {"relative_cameras": True}])
@@ -122,37 +122,37 @@ def test_network_output_is_invariant_to_rigid_motion(changes):
     cameras = _cameras(4, 3)
     motion = _cameras(1, 4).world_from_camera[0]
     moved = Cameras(cameras.intrinsics, motion @ cameras.world_from_camera, cameras.size)
-    maps = [raymap(c, c.world_from_camera[0], 8, 8)[None].float() for c in (cameras, moved)]
+    matrices = [reference_from_image(c, c.world_from_camera[0])[None] for c in (cameras, moved)]
     with torch.no_grad():
-        first, second = (unet(latents, time, m, mask) for m in maps)
+        first, second = (unet(latents, time, m, mask) for m in matrices)
     torch.testing.assert_close(first, second, rtol=0, atol=1e-5)
 
 
 @given(st.integers(0, 10_000))
-def test_camera_vector_is_read_off_the_raymap(seed):
+def test_camera_vector_is_position_rotation_and_focal_length(seed):
     """Position, rotation and focal length, exact to 1e-9 in float64; zeros for a dropped pose."""
     cameras = _cameras(3, seed)
-    vectors = camera_vectors(raymap(cameras, torch.eye(4, dtype=torch.float64), 6, 5))
+    vectors = camera_vectors(reference_from_image(cameras, torch.eye(4, dtype=torch.float64)))
     torch.testing.assert_close(vectors[:, :3], cameras.centers, rtol=0, atol=1e-9)
     torch.testing.assert_close(vectors[:, 7], cameras.intrinsics[:, 0, 0] / 64, rtol=1e-9, atol=0)
     w, x, y, z = vectors[:, 3:7].unbind(-1)
     forward = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1)
     torch.testing.assert_close(forward, cameras.forward, rtol=0, atol=1e-9)
-    assert torch.equal(camera_vectors(torch.zeros(2, 6, 5, 5)), torch.zeros(2, 8))
+    assert torch.equal(camera_vectors(torch.zeros(2, 4, 4)), torch.zeros(2, 8))
 
 
 @given(st.integers(0, 10_000))
-def test_projections_are_read_off_the_raymap(seed):
+def test_projections_take_points_to_the_image_and_back(seed):
     """A point's image place and depth, exact to 1e-9 in float64; the inverse; identities for a dropped pose."""
     cameras = _cameras(3, seed)
-    there, back = view_matrices(raymap(cameras, cameras.world_from_camera[0], 6, 5))
+    there, back = view_matrices(reference_from_image(cameras, cameras.world_from_camera[0]))
     point = torch.tensor([0.3, -0.2, 0.5, 1], dtype=torch.float64)
     in_camera = (torch.linalg.inv(cameras.world_from_camera) @ cameras.world_from_camera[0] @ point)[:, :3]
     pixels = (cameras.intrinsics @ in_camera[..., None])[..., 0] * torch.tensor([2 / 64, 2 / 64, 1.0])
     pixels[:, :2] -= in_camera[:, 2:]
     torch.testing.assert_close(there @ point, torch.cat([pixels, torch.ones(3, 1)], 1).double(), rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(there @ back, torch.eye(4).double().expand(3, 4, 4), rtol=0, atol=1e-9)
-    dropped = view_matrices(torch.zeros(2, 6, 5, 5))
+    dropped = view_matrices(torch.zeros(2, 4, 4))
     assert torch.equal(torch.stack(dropped), torch.eye(4).expand(2, 2, 4, 4))
 
 
@@ -202,12 +202,12 @@ def test_flops_are_those_of_convolutions_products_and_joint_attention():
 @pytest.mark.parametrize("changes", [{}, {"relative_cameras": True}])
 def test_odd_latent_sizes_and_bfloat16_run(changes):
     unet = random_model(**changes).unet
-    latents, time, raymaps, mask = inputs(1, 3, 1)
+    latents, time, cameras, mask = inputs(1, 3, 1)
     with torch.no_grad():
-        odd = unet(latents[..., :7, :5], time, raymaps[..., :7, :5], mask)
+        odd = unet(latents[..., :7, :5], time, cameras, mask)
         assert odd.shape == (1, 3, 8, 7, 5)
-        full = unet(latents, time, raymaps, mask)
-        low = unet.to(torch.bfloat16)(latents, time, raymaps, mask)
+        full = unet(latents, time, cameras, mask)
+        low = unet.to(torch.bfloat16)(latents, time, cameras, mask)
     assert low.dtype == torch.bfloat16
     # bfloat16 has 8 bits of mantissa; a few dozen layers of rounding.
     assert (low.float() - full).norm() / full.norm() < 0.05
@@ -215,6 +215,6 @@ def test_odd_latent_sizes_and_bfloat16_run(changes):
 
 def test_wrong_latent_channels_are_named():
     unet = random_model().unet
-    latents, time, raymaps, mask = inputs(1, 3, 1)
+    latents, time, cameras, mask = inputs(1, 3, 1)
     with pytest.raises(ValueError, match="4 channels"):
-        unet(latents[:, :, :4], time, raymaps, mask)
+        unet(latents[:, :, :4], time, cameras, mask)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
 from cat3d_core.metrics.perceptual import PerceptualDistance
-from cat3d_core.metrics.protocols import PROTOCOLS, evaluate, evaluate_batch, quantize
+from cat3d_core.metrics.protocols import PROTOCOLS, evaluate, quantize
 
 
 def psnr64(x, y):
@@ -152,11 +152,10 @@ def test_white_against_black(name):
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)
-def test_predictions_are_clamped_and_batches_are_views(name):
+def test_predictions_are_clamped(name):
     torch.manual_seed(0)
-    prediction, target = torch.randn(3, 3, 20, 24), torch.rand(3, 3, 20, 24)
-    rows = evaluate_batch(name, prediction, target)
-    assert rows == [evaluate(name, prediction[i].clamp(0, 1), target[i]) for i in range(3)]
+    prediction, target = torch.randn(3, 20, 24), torch.rand(3, 20, 24)
+    assert evaluate(name, prediction, target) == evaluate(name, prediction.clamp(0, 1), target)
 
 
 @pytest.mark.parametrize("how", ["round", "truncate"])
@@ -187,17 +186,10 @@ def image(value=0.5, size=(16, 16)):
         (("google", image(), image(2.0)), r"target has values in \[2, 2\]"),
         (("google", image(size=(1, 1)), image(size=(1, 1))), "at least 11x11 pixels; these images are 1x1"),
         (("regnerf", image(size=(1, 4096)), image(size=(1, 4096))), "at least 7x7 pixels; these images are 4096x1"),
-        (("google", image()[None], image()[None]), "use evaluate_batch"),
+        (("google", image()[None], image()[None]), "takes one view"),
         (("google", image().to(torch.uint8), image()), "divide uint8 images by 255"),
     ],
 )
 def test_errors_are_sentences(arguments, message):
     with pytest.raises(ValueError, match=message):
         evaluate(*arguments)
-
-
-def test_batch_errors_name_the_view():
-    prediction = torch.rand(3, 3, 16, 16)
-    prediction[1, 0, 0, 0] = math.nan
-    with pytest.raises(ValueError, match="View 1: The prediction holds NaN"):
-        evaluate_batch("google", prediction, torch.rand(3, 3, 16, 16))

@@ -19,18 +19,14 @@ def check(plan: Plan) -> None:
     """What holds for every plan."""
     n = len(plan)
     plan.cameras.validate()
-    valid = plan.group_views[plan.group_valid]
-    assert sorted(valid.tolist()) == list(range(n))  # each view in exactly one group
-    for g in range(len(plan.group_views)):
-        targets = int(plan.group_targets[g])
-        members = plan.group_views[g, :targets]
-        assert (members >= 0).all()
-        assert (plan.group_views[g, targets:] == -1).all()
-        kept = members[plan.group_valid[g, :targets]]
-        assert set(members.tolist()) == set(kept.tolist())  # pads repeat the group's own views
-        assert (plan.group[kept] == g).all()
-        assert plan.order_in_group[kept].tolist() == list(range(len(kept)))
+    assert sorted(v for group in plan.groups for v in group.targets) == list(range(n))  # each view in exactly one group
+    assert plan.group_views.tolist() == [
+        [*group.targets, *[-1] * (plan.group_views.shape[1] - len(group.targets))] for group in plan.groups
+    ]
+    for group in plan.groups:
+        kept = list(group.targets)
         assert (plan.condition[kept] == plan.condition[kept[0]]).all()
+        assert plan.condition[kept[0]][plan.condition[kept[0]] >= 0].tolist() == list(group.conditions)
         assert plan.sample_kind[kept].unique().numel() == 1
         assert plan.anchor[kept].unique().numel() == 1
         if not plan.anchor[kept[0]]:
@@ -43,6 +39,10 @@ def check(plan: Plan) -> None:
         assert all(plan.sample_kind[u] == plan.sample_kind[v] and not plan.anchor[v] for u in used)
 
 
+def sizes(plan: Plan) -> list[int]:
+    return [len(group.targets) for group in plan.groups]
+
+
 @pytest.mark.parametrize("name", sorted(FAMILIES))
 def test_few_view_plans_of_each_family(name: str) -> None:
     captured = FAMILIES[name]()
@@ -50,11 +50,11 @@ def test_few_view_plans_of_each_family(name: str) -> None:
     check(plan)
     assert plan.recipe == name
     assert len(plan) == RECIPES[name].count
-    assert plan.group_targets.tolist() == [5] * (len(plan) // 5)
+    assert sizes(plan) == [5] * (len(plan) // 5)
     assert plan.condition.shape == (len(plan), 3)
     assert (plan.condition < len(captured)).all()
     assert not plan.anchor.any()
-    assert plan.passes() == [list(range(len(plan.group_views)))]
+    assert plan.passes() == [list(range(len(plan.groups)))]
     assert plan.plan_coverage.directions > plan.captured_coverage.directions
     assert plan.plan_coverage.seen >= plan.captured_coverage.seen
 
@@ -65,7 +65,7 @@ def test_single_image_plan_is_the_papers(name: str) -> None:
     check(plan)
     assert len(plan) == 80
     # Seven anchors in one pass of 1 + 7 on the captured view alone, then groups of 5 on 3: captured and two anchors.
-    assert plan.group_targets.tolist() == [7] + [5] * 15
+    assert sizes(plan) == [7] + [5] * 14 + [3]
     assert plan.anchor.sum() == 7
     assert plan.passes() == [[0], list(range(1, 16))]
     assert plan.condition[plan.anchor].tolist() == [[0, -1, -1]] * 7
@@ -73,7 +73,6 @@ def test_single_image_plan_is_the_papers(name: str) -> None:
     assert (rest[:, 0] == 0).all()
     assert (rest[:, 1:] >= 1).all()
     assert (rest[:, 1] != rest[:, 2]).all()
-    assert int((~plan.group_valid[:, :5]).sum()) == 2  # 73 = 14 * 5 + 3
 
 
 @settings(max_examples=5)
@@ -116,22 +115,21 @@ def test_a_plan_is_the_same_every_time_and_in_float32() -> None:
 def test_groups_hold_neighbours() -> None:
     plan = make_plan(ring(), PlanConfig(image_size=32))
     centers = plan.cameras.centers
-    within = torch.stack([torch.pdist(centers[row]).max() for row in plan.group_views])
+    within = torch.stack([torch.pdist(centers[row]).max() for row in plan.group_views])  # no short group in it
     random = torch.stack([torch.pdist(centers[torch.randperm(len(plan))[:5]]).max() for _ in range(100)])
     assert within.max() < 0.4
     assert within.mean() < 0.25 * random.mean()
 
 
-def test_short_groups_are_padded_and_conditions_can_be_any_number() -> None:
+def test_the_last_group_may_be_short_and_conditions_can_be_any_number() -> None:
     plan = make_plan(arc(), PlanConfig(count=23, image_size=32, conditions=1))
     check(plan)
-    assert plan.group_targets.unique().tolist() == [7]
-    assert int((~plan.group_valid).sum()) == 5
+    assert sizes(plan) == [7, 7, 7, 2]
     wide = make_plan(arc(2), PlanConfig(count=20, image_size=32, conditions=4, group_size=4))
     check(wide)
     assert set(wide.condition[0].tolist()) == {0, 1}
     none = make_plan(arc(2), PlanConfig(count=20, image_size=32, repeat_conditions=False))
-    assert (none.condition[:, 2] == -1).all()
+    assert all(set(group.conditions) == {0, 1} and len(group.conditions) == 2 for group in none.groups)
 
 
 def test_two_captured_views_condition_every_group_nearest_first() -> None:
@@ -153,14 +151,14 @@ def test_anchors_of_several_views_and_keeping_captured_ones() -> None:
     rest = kept.condition[~kept.anchor]
     assert all({0, 1} < set(row) for row in rest.tolist())
     assert not all({0, 1} <= set(row) for row in near.condition[~near.anchor].tolist())
-    assert [len(p) for p in near.passes()] == [2, 10 + int((near.group_targets == 5).sum()) - 12]
+    assert [len(p) for p in near.passes()] == [2, len(near.groups) - 2]
 
 
 def test_more_anchors_than_views_and_no_anchors() -> None:
     few = make_plan(single(), PlanConfig(count=4, image_size=32))
     check(few)
     assert few.anchor.all()
-    assert few.group_targets.tolist() == [7]
+    assert sizes(few) == [4]
     none = make_plan(single(), PlanConfig(count=10, image_size=32, anchors=0))
     check(none)
     assert none.condition.tolist() == [[0, 0, 0]] * 10
@@ -172,7 +170,7 @@ def test_square_and_wide_samples_of_wide_images() -> None:
     both = make_plan(captured, PlanConfig(count=40, image_size=32, samples="both"))
     check(both)
     assert len(both) == 80
-    assert both.pose.tolist() == [*range(40), *range(40)]
+    assert torch.equal(both.cameras.world_from_camera[:40], both.cameras.world_from_camera[40:])
     wide = both.sample_kind == WIDE
     assert torch.equal(both.cameras.world_from_camera[~wide], both.cameras.world_from_camera[wide])
     assert torch.equal(both.cameras.intrinsics[~wide], square.cameras.intrinsics)
@@ -212,6 +210,35 @@ def test_a_path_can_be_fitted_to_more_views_than_are_captured() -> None:
     assert torch.equal(fitted.cameras.world_from_camera, whole.cameras.world_from_camera)
     assert fitted.captured_count == 3
     assert fitted.condition.max() == 2
+
+
+@pytest.mark.parametrize("views", [2, 3, 8, 21])
+def test_groups_are_as_large_as_the_generator_takes(views: int) -> None:
+    """What is given and what is made come to `views`; of a single image the anchors are made on it alone."""
+    plan = make_plan(arc(), PlanConfig(count=40, image_size=32, views=views))
+    check(plan)
+    given = min(3, views - 1)
+    assert {len(group.conditions) for group in plan.groups} == {given}
+    assert max(sizes(plan)) == views - given
+    assert sum(size < views - given for size in sizes(plan)) <= len(plan.path.unique()), "the last of a path"
+    alone = make_plan(single(), PlanConfig(count=40, image_size=32, views=views))
+    check(alone)
+    anchors = [group for group in alone.groups if group.anchors]
+    assert [len(group.targets) for group in anchors] == (
+        [7] if views >= 8 else [views - 1] * (7 // (views - 1)) + ([1] if 7 % (views - 1) else [])
+    )
+
+
+def test_a_plan_among_all_captured_views_names_the_same_views() -> None:
+    """Planned from views 2, 5 and 9 of 12: conditions are those numbers, anchors come after all 12."""
+    captured = ring(3)
+    plan = make_plan(captured, PlanConfig(count=40, image_size=32, anchors=5))
+    there = plan.among([2, 5, 9], 12)
+    assert there.captured_count == 12
+    for one, other in zip(plan.groups, there.groups, strict=True):
+        for here, moved in zip(one.conditions, other.conditions, strict=True):
+            assert moved == ([2, 5, 9][here] if here < 3 else here - 3 + 12)
+    check(there)
 
 
 def test_overrides() -> None:

@@ -113,7 +113,7 @@ def test_the_unconditional_half_is_not_computed_where_guidance_is_off(scale: flo
     model.unet.register_forward_hook(lambda _module, given, _out: batches.append(given[0].shape[0]))
     noise = torch.randn(1, 5, 8, 8, 8, generator=torch.Generator().manual_seed(0))
     config = SamplerConfig(steps=6, guidance=GuidanceConfig(scale, high_log_snr=high))
-    sample(model, torch.zeros(1, 3, 8, 8, 8), torch.zeros(1, 8, 6, 8, 8), noise, config)
+    sample(model, torch.zeros(1, 3, 8, 8, 8), torch.zeros(1, 8, 4, 4), noise, config)
     assert len(batches) == 6
     assert sum(batches) == evaluations(config, Schedule(model.config.schedule, 5))
     levels = Schedule(model.config.schedule, 5).nodes("log_snr", 6)

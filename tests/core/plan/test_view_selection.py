@@ -15,7 +15,6 @@ from cat3d_core.view_selection import (
     covering_radius,
     farthest_points,
     nearest_views,
-    pad_group,
     pose_distance,
 )
 from tests.core.plan.layouts import cameras, forward_facing, ring, single
@@ -66,13 +65,6 @@ def test_groups_partition_the_views_in_order(count: int, size: int) -> None:
     groups = consecutive_groups(list(range(count)), size)
     assert [v for g in groups for v in g] == list(range(count))
     assert all(len(g) == size for g in groups[:-1])
-
-
-def test_short_groups_are_padded_by_repeats_that_are_marked() -> None:
-    assert pad_group([4, 5], 5) == ([4, 5, 5, 5, 5], [True, True, False, False, False])
-    assert pad_group([1, 2], 2) == ([1, 2], [True, True])
-    with pytest.raises(ValueError, match="cannot be padded"):
-        pad_group([], 5)
 
 
 def test_nearest_views_by_brute_force() -> None:

@@ -2,10 +2,11 @@
 
 import torch
 
-from cat3d_core.diffusion import GuidanceConfig, SamplerConfig, describe, load_model, sample
+from cat3d_core.diffusion import describe, load_model
+from cat3d_core.generation import Cat3dGenerator, generate
+from cat3d_core.generation.advice import FEW_STEPS
 from cat3d_core.metrics.psnr import psnr
 from cat3d_core.random import normal
-from cat3d_core.rays import raymap
 from cat3d_core.synthetic.dataset import training_capture
 from cat3d_core.weights import default_model_path
 
@@ -20,16 +21,14 @@ def test_it_says_what_it_is_and_fits_the_budget():
 
 def test_its_samples_follow_the_views_given():
     """Against the flat mean colour of the views given, which is what a model that ignores cameras could reach."""
-    model = load_model(default_model_path())
-    sampler = SamplerConfig("ddim", "trailing", 4, GuidanceConfig(scale=1.0))
+    generator = Cat3dGenerator(load_model(default_model_path()))
+    size, shape = generator.spec.image_size[0], generator.spec.latent_shape
     gains = []
     for number, family in enumerate(("llff", "dtu", "re10k")):
-        capture = training_capture(family, 10_000_019 + number, 8, model.config.image_size)
-        cameras = capture.cameras
-        latents = model.autoencoder.encode(capture.image)
-        rays = raymap(cameras, cameras.world_from_camera[0], *latents.shape[-2:]).float()
-        noise = normal((1, 5, *latents.shape[1:]), 0, family)
-        images = model.autoencoder.decode(sample(model, latents[None, :3], rays[None], noise, sampler)[0])
+        capture = training_capture(family, 10_000_019 + number, 8, size)
+        noise = normal((5, *shape), 0, family)
+        given = [(capture.image[:3], capture.cameras)]
+        (images,) = generate(generator, given, FEW_STEPS, lambda _, view: noise[view - 3])  # noqa: B023
         truth = capture.image[3:]
         flat = capture.image[:3].mean((0, 2, 3))[None, :, None, None].expand_as(truth)
         gains.append(psnr(images, truth).mean() - psnr(flat, truth).mean())

@@ -39,6 +39,7 @@ from flows.exports.splat_files import READERS
 from flows.jobs.access import read_cameras
 from flows.jobs.request import make_config
 from flows.media.images import read_image
+from flows.open3d_import import import_open3d
 from flows.pipeline.runner import opened, run_missing
 from flows.readers import read_capture
 from schemas.scene_store import SceneStore
@@ -172,7 +173,7 @@ def test_open3d_without_libusb_says_the_line_to_type(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(builtins, "__import__", broken)
     with pytest.raises(InputError, match="sudo apt-get install -y libusb-1.0-0"):
-        meshes.import_open3d()
+        import_open3d("Meshes")
 
 
 @pytest.mark.parametrize("reader", ["transforms", "colmap", "auto"])

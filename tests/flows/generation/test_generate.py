@@ -9,14 +9,17 @@ import pytest
 import torch
 
 from cat3d_core.cameras import Cameras
+from cat3d_core.rays import raymap
 from cat3d_core.sample_sets import source_boxes
 from flows.errors import InputError
 from flows.generation.groups import StoredPlan
+from flows.generation.open import open_generator
+from flows.generation.views import generated_views
 from flows.jobs.job import Job
 from flows.jobs.request import Request, make_config, make_request
 from flows.media.images import PADDING, read_image, square_image
 from flows.pipeline.keys import pending
-from flows.stages.training_views import generated_views, no_finer
+from flows.stages.training_views import no_finer
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
 from schemas.tables import TIMINGS, read_rows
@@ -105,8 +108,8 @@ def test_wide_samples_are_planned_encoded_and_kept_without_their_padding(model: 
     assert not torch.equal(square, wide)
     run_stages(job, "sample", "decode")
     views = list(generated_views(run_of(job)))
-    assert [tuple(image.shape) for _, image in views] == [(64, 64, 3)] * 5 + [(48, 64, 3)] * 5
-    for (narrow, _), (broad, _) in zip(views[:5], views[5:]):
+    assert [tuple(view.image.shape) for view in views] == [(64, 64, 3)] * 5 + [(48, 64, 3)] * 5
+    for narrow, broad in zip((v.camera for v in views[:5]), (v.camera for v in views[5:])):
         assert torch.equal(narrow.world_from_camera, broad.world_from_camera)
         # The same sky: 24 rows of the photo are 64 rows of the square sample and 48 of the wide one.
         assert torch.allclose(narrow.intrinsics[0, 1, 1] / 64, broad.intrinsics[0, 1, 1] / 48)
@@ -131,7 +134,8 @@ def test_raymaps_and_conditions_follow_the_world_frame_of_the_store(model: Path,
     store = SceneStore.open(job.store_path)
     plan = StoredPlan(store, store.run(job.run), 0)
     group = plan.groups[1]
-    maps = plan.raymaps(group, 8)
+    cameras = plan.view_group(group, open_generator(job)).cameras
+    maps = raymap(cameras, cameras.world_from_camera[0], 8, 8).float()
     assert maps.shape == (8, 6, 8, 8)
     assert torch.allclose(maps[0, :3], torch.zeros(3, 8, 8), atol=1e-6)
     centre = maps[0, 3:, 3:5, 3:5].mean((1, 2))

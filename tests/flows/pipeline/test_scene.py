@@ -210,8 +210,10 @@ def test_auto_generates_views_for_a_single_photo_only(tmp_path: Path) -> None:
 
 def test_the_sampler_is_the_runs_own_else_the_models_else_the_measured_default(tmp_path: Path) -> None:
     from cat3d_core.diffusion import SIZES, MultiViewModel, save_model
-    from flows.generation.model import PAPER_SAMPLER, SAMPLER_DEFAULT, sampler_settings
+    from flows.generation.sampling import sampler_settings
 
+    measured = {"solver": "unipc", "nodes": "log_snr", "steps": 10, "guidance": 3.0}
+    paper = {"solver": "ddim", "nodes": "trailing", "steps": 50, "guidance": 3.0}
     advice = {"solver": "ddim", "nodes": "trailing", "steps": 4, "guidance": 1.0}
     for name, provenance in {"plain": {}, "advised": {"sampler": advice}}.items():
         save_model(tmp_path / f"{name}.safetensors", MultiViewModel(SIZES["tiny"]), provenance)
@@ -221,9 +223,9 @@ def test_the_sampler_is_the_runs_own_else_the_models_else_the_measured_default(t
         return sampler_settings(Request(SCENE, tmp_path, ("3",), make_config(given, None, settings)).jobs()[0])
 
     skipped = {"guidance_log_snr": [None, 2.0], "near_steps": False}
-    assert chosen("plain") == SAMPLER_DEFAULT | skipped
+    assert chosen("plain") == measured | skipped
     everything = {"guidance_log_snr": [None, None], "near_steps": False}
     assert chosen("advised") == advice | everything, "without guidance there is no interval of it"
     assert chosen("advised", "sample.steps=9") == advice | {"steps": 9} | everything
-    assert chosen("plain", "skip=none") == PAPER_SAMPLER | everything
-    assert chosen("plain", "skip=none", "sample.guidance_log_snr=[-5, 2]") == PAPER_SAMPLER | everything
+    assert chosen("plain", "skip=none") == paper | everything
+    assert chosen("plain", "skip=none", "sample.guidance_log_snr=[-5, 2]") == paper | everything

@@ -6,7 +6,6 @@ The reconstructor is the one of docs/guides/own_reconstructor.md, as it stands t
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 
 import numpy as np
@@ -30,25 +29,11 @@ from flows.reporting.report import write_report
 from flows.reporting.summary import summary_rows
 from schemas.scene_store import SceneStore
 from schemas.tables import read_rows
+from tests.flows.packages import install_guide
 from tests.flows.workers.scene import run_stages
 
-GUIDE = Path(__file__).resolve().parents[3] / "docs" / "guides" / "own_reconstructor.md"
 SOURCE = "procedural:dtu/3?views=9&width=32&height=24"
 STAGES = ("ingest", "poses", "reconstruct", "render", "evaluate")
-
-
-def install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The package of the guide, as pip would leave it in a folder that Python looks in."""
-    code, entry = re.findall(r"^```(?:python|toml)\n(.*?)^```", GUIDE.read_text(), re.DOTALL | re.MULTILINE)
-    points = re.search(r"entry-points\.\"(.+)\"\]\n(.*)\n", entry)
-    assert points is not None
-    assert points[1] == GROUP
-    metadata = folder / "nearest_photo-1.0.dist-info"
-    metadata.mkdir(parents=True)
-    (folder / "nearest_photo.py").write_text(code)
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: nearest_photo\nVersion: 1.0\n")
-    (metadata / "entry_points.txt").write_text(f"[{GROUP}]\n{points[2]}\n".replace('"', ""))
-    monkeypatch.syspath_prepend(str(folder))
 
 
 def job(out: Path, *settings: str) -> Job:
@@ -61,7 +46,7 @@ def brightness(view: Comparison) -> float:
 
 
 def test_a_strangers_reconstructor_and_metric_reach_the_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    install(tmp_path / "site", monkeypatch)
+    install_guide(tmp_path / "site", monkeypatch, "own_reconstructor.md", GROUP)
     out = tmp_path / "out"
     one = job(out)
     run_stages(one, *STAGES)
@@ -97,7 +82,7 @@ def test_a_strangers_reconstructor_and_metric_reach_the_report(tmp_path: Path, m
 def test_its_settings_are_refused_by_name_and_change_the_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from schemas.errors import ConfigError
 
-    install(tmp_path / "site", monkeypatch)
+    install_guide(tmp_path / "site", monkeypatch, "own_reconstructor.md", GROUP)
     with pytest.raises(ConfigError, match="reconstruct.overrides: there is nothing to set"):
         expected_steps(job(tmp_path, "reconstruct.overrides={iterations: 3}"))
     ours = expected_steps(job(tmp_path, "reconstruct.method=zipnerf"))["reconstruct"]

@@ -12,7 +12,8 @@ import pytest
 from rich.console import Console
 
 from flows.pipeline.keys import downstream
-from flows.reporting.inspect import as_text, inspect_store, stale_stages
+from flows.reporting.inspect import inspect_store, stale_stages
+from flows.reporting.inspect_text import as_text
 from schemas.errors import StoreError
 from schemas.scene_store import SceneStore, StageRecord
 
@@ -135,7 +136,6 @@ def test_the_text_names_every_array_stage_and_problem(store: SceneStore) -> None
         "captured/",
         "world_from_camera",
         "3x40x60x3",
-        "zstd+bitshuffle",
         "2/4",
         "stale: its",
         "2 of 60x40, 1 of 60x20 px",

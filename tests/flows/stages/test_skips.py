@@ -10,12 +10,16 @@ import torch
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.diffusion import GuidanceConfig, SamplerConfig, sample
+from cat3d_core.generation import Cat3dGenerator
 from cat3d_core.plan import PlanConfig, make_plan
+from cat3d_core.rays import reference_from_image
 from cat3d_core.reconstruction import Views
 from cat3d_core.zipnerf import Trainer, ZipNerfConfig
 from cat3d_core.zipnerf.settings import config_from_document, fitted, left_out
 from flows.generation.groups import StoredPlan
-from flows.generation.model import shared_model
+from flows.generation.open import open_generator
+from flows.generation.plan import read_plan
+from flows.generation.views import generated_views
 from flows.jobs.access import read_cameras, read_images
 from flows.jobs.job import Job
 from flows.jobs.request import Request, make_config
@@ -25,8 +29,8 @@ from flows.reconstruction.open import open_reconstructor
 from flows.reconstruction.stored import read_reconstruction
 from flows.reporting.inspect import inspect_store
 from flows.stages import sample as sample_stage
-from flows.stages.sample import group_sampler, network_inputs
-from flows.stages.training_views import generated_views, training_views
+from flows.stages.sample import group_sampler
+from flows.stages.training_views import training_views
 from schemas.config import parse_config
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
@@ -112,14 +116,18 @@ def test_without_skips_every_stage_is_the_plain_core_bit_for_bit(model: Path, tm
     captured = read_cameras(store.captured, train)
     plain = make_plan(captured, PlanConfig(count=VIEWS, conditions=3, image_size=64), _points(store), _bounds(store))
     assert np.array_equal(run.plan.read("world_from_camera"), plain.cameras.world_from_camera.numpy())
-    assert np.array_equal(run.plan.read("group_views"), plain.group_views.numpy())
-    plan, network = StoredPlan(store, run, one.config.seed), shared_model(one)
+    assert read_plan(run.plan, 9).groups == plain.among(train, 9).groups
+    plan, generator = StoredPlan(store, run, one.config.seed), open_generator(one)
+    assert isinstance(generator, Cat3dGenerator)
+    network = generator.model
     config = SamplerConfig("ddim", "trailing", 4, GuidanceConfig(3.0), micro_batch=1)
     threads = torch.get_num_threads()
     torch.set_num_threads(one.config.execution.threads)
     try:
         for group in plan.groups[:2]:
-            latents = sample(network, *network_inputs(plan, [group], (8, 8, 8)), config)[0].half()
+            given = plan.view_group(group, generator)
+            cameras = reference_from_image(given.cameras, given.cameras.world_from_camera[0])[None]
+            latents = sample(network, given.latents[None], cameras, given.noise[None], config)[0].half()
             assert np.array_equal(run.generated.read("latent", group.targets), latents.numpy())
             with torch.no_grad():
                 decoded = network.autoencoder.decode(latents[:1].float()).permute(0, 2, 3, 1)
@@ -128,8 +136,8 @@ def test_without_skips_every_stage_is_the_plain_core_bit_for_bit(model: Path, tm
         torch.set_num_threads(threads)
     made = list(generated_views(run))
     assert len(made) == VIEWS
-    cameras = Cameras.cat([captured, *(camera for camera, _ in made)])
-    images = [*read_images(store.captured, train), *(image for _, image in made)]
+    cameras = Cameras.cat([captured, *(view.camera for view in made)])
+    images = [*read_images(store.captured, train), *(view.image for view in made)]
     views = Views.from_images(cameras, images, torch.arange(len(cameras)) < 3)
     trainer = Trainer(trainer_config(one), views, one.config.seed)
     while not trainer.finished:

@@ -305,14 +305,15 @@ def test_photographs_are_half_of_the_autoencoder_s_images() -> None:
     assert draw_images(torch.zeros(5, 3, 16, 16, dtype=torch.uint8), None, 6, torch.Generator()).sum() == 0
 
 
-def test_jitter_scales_origins_and_keeps_directions() -> None:
-    rays = torch.rand(6, 8, 6, 4, 4) + 0.1
-    out = jitter_scale(rays, 1.5, torch.Generator().manual_seed(0))
-    factor = out[:, :, :3] / rays[:, :, :3]
-    assert torch.equal(out[:, :, 3:], rays[:, :, 3:])
+def test_jitter_scales_positions_and_keeps_directions() -> None:
+    cameras = torch.rand(6, 8, 4, 4, dtype=torch.float64) + 0.1
+    out = jitter_scale(cameras, 1.5, torch.Generator().manual_seed(0))
+    factor = out[:, :, :3, 3:] / cameras[:, :, :3, 3:]
+    assert torch.equal(out[..., :3], cameras[..., :3])
+    assert torch.equal(out[:, :, 3], cameras[:, :, 3])
     assert factor.min() >= 1 / 1.5 - 1e-6
     assert factor.max() <= 1.5 + 1e-6
-    torch.testing.assert_close(factor, factor[:, :1, :1, :1, :1].expand_as(factor))
+    torch.testing.assert_close(factor, factor[:, :1, :1, :1].expand_as(factor))
 
 
 def test_scores_tell_right_cameras_from_wrong_ones() -> None:

@@ -8,12 +8,11 @@ import torch
 
 from flows.errors import WorkerError
 from flows.generation.groups import StoredPlan
-from flows.generation.model import sampler_config, shared_model
-from flows.generation.shrinking import sample_at_most
+from flows.generation.open import open_generator
 from flows.jobs.job import Job
 from flows.pipeline.keys import Step, downstream, expected_steps
 from flows.stages import sample as sample_stage
-from flows.stages.sample import alike, network_inputs, sample_work
+from flows.stages.sample import sample_work
 from flows.workers import fan_out as fan_out_module
 from flows.workers.executors import open_executor
 from flows.workers.fan_out import fan_out
@@ -174,44 +173,31 @@ def test_several_scenes_share_the_workers(scene, expected) -> None:
     assert fan_out([sample_work(jobs[0], store, works[0].key)], jobs[0].config.execution, "again").batches == 0
 
 
-def test_out_of_memory_halves_the_batch_and_gives_the_same_result(scene, monkeypatch) -> None:
-    """The allocator's error is raised by hand where more than one group is evaluated; the rest is real."""
-    from flows.generation import shrinking
+def test_a_lack_of_memory_is_a_sentence_about_the_group(scene, monkeypatch) -> None:
+    """The allocator's error is raised by hand; halving itself is tested in tests/core/generation."""
+
+    def none_left(*arguments):  # type: ignore[no-untyped-def]
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
 
     job = scene()
-    store = SceneStore.open(job.store_path)
-    plan = StoredPlan(store, store.run(job.run), job.config.seed)
-    tensors = network_inputs(plan, alike([(sampler_config(job), g) for g in plan.groups], 4)[0][1], (8, 8, 8))
-    model, config, real = shared_model(job), sampler_config(job), shrinking.sample
-    alone, _ = sample_at_most(1, model, tensors, config)
-    together, held = sample_at_most(4, model, tensors, config)
-    assert held == 4
-    # Another batch is another order of summation inside the kernels, amplified by guidance: rounding, in float32.
-    assert torch.allclose(together, alone, atol=1e-3)
-
-    def limited(*arguments):  # type: ignore[no-untyped-def]
-        if arguments[-1].micro_batch > largest:
-            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
-        return real(*arguments)
-
-    monkeypatch.setattr(shrinking, "sample", limited)
-    largest = 1
-    shrunk, held = sample_at_most(4, model, tensors, config)
-    assert held == 1
-    assert torch.equal(shrunk, alone)
-    largest = 0
+    store = SceneStore.open(job.store_path, "r+")
+    key = steps_of(job)["sample"].key
+    sample_work(job, store, key)
+    monkeypatch.setattr("cat3d_core.generation.cat3d.sample", none_left)
     with pytest.raises(WorkerError, match="Memory doesn't hold one group of 8 views on cpu"):
-        sample_at_most(2, model, tensors, config)
+        sample_stage.work(job, store, key, [0])
 
 
-def test_groups_of_different_shapes_are_never_evaluated_together(scene) -> None:
-    job = scene("1")
-    store = SceneStore.open(job.store_path)
-    plan = StoredPlan(store, store.run(job.run), 0)
-    chunks = [chunk for _, chunk in alike([(sampler_config(job), g) for g in plan.groups], 3)]
-    assert [g for chunk in chunks for g in chunk] == plan.groups
-    assert all(len({(len(g.conditions), len(g.targets)) for g in chunk}) == 1 for chunk in chunks)
-    assert max(map(len, chunks)) <= 3
+def test_groups_evaluated_together_are_those_evaluated_alone(scene, expected) -> None:
+    """Groups of 1 + 7 and of 3 + 5 views, three at a time: only rounding differs, amplified by guidance."""
+    job = scene("1", groups_at_once=3)
+    store = SceneStore.open(job.store_path, "r+")
+    key = steps_of(job)["sample"].key
+    work = sample_work(job, store, key)
+    for items in work.passes:
+        sample_stage.work(job, store, key, items)
+    together = run_of(job).generated.read("latent").astype(np.float32)
+    assert np.abs(together - expected["1"].astype(np.float32)).max() < 5e-3  # float16 latents up to 4
 
 
 def test_noise_depends_on_scene_seed_and_view_alone(scene) -> None:
@@ -239,7 +225,7 @@ def test_batches_last_about_as_long_as_asked_and_shrink_towards_the_end(scene) -
 
 def test_a_workers_error_keeps_its_type_and_names_its_cause(scene) -> None:
     batch = Batch(
-        number=7, job=scene(), stage="sample", key="0" * 64, items=(0,), load=shared_model, share=sample_stage.work
+        number=7, job=scene(), stage="sample", key="0" * 64, items=(0,), load=open_generator, share=sample_stage.work
     )  # nobody has made room for the latents
     assert Batch.model_validate_json(batch.model_dump_json()) == batch
     answer = run_batch(batch)

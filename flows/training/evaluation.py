@@ -22,49 +22,30 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.diffusion import GuidanceConfig, MultiViewModel, SamplerConfig, load_model, sample
+from cat3d_core.diffusion import SamplerConfig
+from cat3d_core.generation import Generator, generate
+from cat3d_core.generation.advice import FEW_STEPS, MANY_STEPS
 from cat3d_core.metrics.perceptual import PerceptualDistance, find_perceptual
 from cat3d_core.metrics.psnr import psnr
 from cat3d_core.metrics.ssim import ssim
 from cat3d_core.normalization import normalize_scene
-from cat3d_core.random import derive_seed, generator, normal
-from cat3d_core.rays import image_rays, raymap
+from cat3d_core.random import normal
+from cat3d_core.rays import image_rays
 from cat3d_core.sample_sets import sample_cameras, source_boxes
-from cat3d_core.synthetic import FAMILIES, random_cameras, random_scene, trace
-from cat3d_core.synthetic.dataset import surface_points
+from cat3d_core.synthetic import FAMILIES
+from cat3d_core.synthetic.held_out import held_out_group
 from cat3d_core.synthetic.tracer import Traced
+from cat3d_core.view_selection import camera_distance
 from flows.errors import InputError
+from flows.generation.formats import cat3d
+from flows.jobs.device import device
 from flows.media.images import read_image, square_image, write_png
 from flows.readers.base import read_capture
+from flows.training.worlds.held_out import held_out_worlds
 
 CAPTURED = ("llff_fern", "dtu_scan24", "co3d_apple", "re10k_bedroom", "mipnerf360_bonsai", "fox")
 ALL_CAPTURED = "all captured"
-# A young model predicts well what its views have in common and badly the rest: its samples are best after few steps.
-FEW_STEPS = SamplerConfig("ddim", "trailing", 4, GuidanceConfig(scale=1.0))
-MANY_STEPS = SamplerConfig("unipc", "log_snr", 20, GuidanceConfig(scale=1.0))
-
-
-def held_out_group(family: str, number: int, size: int, views: int = 8, spread: float = 0.7) -> tuple[Traced, Cameras]:
-    """Views (N, ...) and normalised cameras of held-out scene `number`, in random order."""
-    for attempt in range(10):
-        seed = derive_seed(1, "held-out scene", family, number, attempt) & 0x7FFFFFFF
-        scene = random_scene(family, seed)
-        try:
-            cameras = random_cameras(scene, seed, views, size, size, spread=spread)
-        except ValueError:  # no free place for the cameras: the next seed
-            continue
-        cameras = cameras[torch.randperm(views, generator=generator(seed, "order"))]
-        traced = trace(scene, cameras)
-        similarity = normalize_scene(cameras, surface_points(traced.depth, cameras))
-        # Depth in the unit of the normalised cameras.
-        return traced._replace(depth=traced.depth * similarity.scale), similarity.cameras(cameras)
-    raise ValueError(f"No cameras stand free in held-out scene {number} of family '{family}'.")
-
-
-def camera_distance(cameras: Cameras) -> Tensor:
-    """(N, N) distance between centres plus angle between viewing directions (radians)."""
-    cosine = (cameras.forward @ cameras.forward.T).clamp(-1, 1)
-    return torch.cdist(cameras.centers, cameras.centers) + torch.acos(cosine)
+WORLDS = "held-out worlds"
 
 
 def warp(traced: Traced, cameras: Cameras, target: int, sources: list[int]) -> tuple[Tensor, Tensor]:
@@ -108,22 +89,18 @@ def captured_group(scene: Path, size: int, given: int, views: int = 8) -> tuple[
     return images, sample_cameras(cameras, "square", size)
 
 
-@torch.no_grad()
 def evaluate_group(
-    model: MultiViewModel, image: Tensor, cameras: Cameras, given: int, sampler: SamplerConfig, key: tuple
+    generator: Generator, image: Tensor, cameras: Cameras, given: int, sampler: SamplerConfig, key: tuple
 ) -> dict[str, Tensor]:
     """Images (N - given, 3, H, W) of each method but `warp`, and `truth`; image (N, 3, H, W), the first `given`
     given."""
-    device = next(model.parameters()).device
-    targets = list(range(given, len(cameras)))
-    latents = model.autoencoder.encode(image.to(device))
-    h, w = latents.shape[-2:]
-    rays = raymap(cameras, cameras.world_from_camera[0], h, w).float().to(device)
-    noise = torch.stack([normal(latents.shape[1:], 0, *key, view, "noise") for view in targets]).to(device)
-    out = sample(model, latents[None, :given], rays[None], noise[None], sampler)[0]
+    shape, truth = generator.spec.latent_shape, image[given:]
+    (made,) = generate(
+        generator, [(image[:given], cameras)], sampler, lambda _, view: normal(shape, 0, *key, view, "noise")
+    )
     nearest = image[camera_distance(cameras)[given:, :given].argmin(1)]
-    return {"sample": model.autoencoder.decode(out).cpu(), "nearest": nearest,
-            "autoencoder": model.autoencoder.decode(latents[given:]).cpu(), "truth": image[given:]}  # fmt: skip
+    return {"sample": made, "nearest": nearest, "autoencoder": generator.decode(generator.encode(truth)),
+            "truth": truth}  # fmt: skip
 
 
 def warped(traced: Traced, cameras: Cameras, given: int) -> Tensor:
@@ -138,18 +115,19 @@ def warped(traced: Traced, cameras: Cameras, given: int) -> Tensor:
 
 
 def rows(
-    model: MultiViewModel,
+    generator: Generator,
     scenes_per_family: int = 20,
     conditions: tuple[int, ...] = (3, 1),
     sampler: SamplerConfig | None = None,
     perceptual: PerceptualDistance | None = None,
     pictures: Path | None = None,
     captured: Sequence[Path] = (),
+    worlds: Path | None = None,
 ) -> list[dict[str, Any]]:
-    """One row per family (and "all"), captured scene, number of conditioning views and method: mean PSNR, SSIM
-    (gaussian, valid) and, where a network is given, its distance, over all target views. pictures: a folder for contact
-    sheets."""
-    sampler, size, views = sampler or FEW_STEPS, model.config.image_size, model.config.views
+    """One row per family (and "all"), captured scene, the held-out worlds of a folder, number of conditioning views
+    and method: mean PSNR, SSIM (gaussian, valid) and, where a network is given, its distance, over all target views.
+    pictures: a folder for contact sheets."""
+    sampler, size, views = sampler or FEW_STEPS, generator.spec.image_size[0], generator.spec.views
     scores: dict[tuple, list[dict[str, float]]] = defaultdict(list)
 
     def take(labels: tuple[str, ...], given: int, images: dict[str, Tensor]) -> None:
@@ -167,15 +145,25 @@ def rows(
         for number in range(scenes_per_family):
             traced, cameras = held_out_group(family, number, size, views)
             for given in conditions:
-                images = evaluate_group(model, traced.image, cameras, given, sampler, (family, number))
+                images = evaluate_group(generator, traced.image, cameras, given, sampler, (family, number))
                 images["warp"] = warped(traced, cameras, given)
                 take((family, "all"), given, images)
                 if pictures is not None and number < 3:
                     _contact_sheet(pictures / f"{family}_{number}_{given}.png", traced.image[:given], images)
+    for world in held_out_worlds(worlds, views) if worlds else ():
+        image = F.interpolate(world.image, (size, size), mode="area")
+        traced = Traced(image, F.interpolate(world.depth[:, None], (size, size))[:, 0], torch.zeros_like(image))
+        cameras = world.cameras.resize(size, size)
+        for given in conditions:
+            images = evaluate_group(generator, image, cameras, given, sampler, (world.name,))
+            images["warp"] = warped(traced, cameras, given)
+            take((WORLDS,), given, images)
+            if pictures is not None:
+                _contact_sheet(pictures / f"world_{world.name}_{given}.png", image[:given], images)
     for scene in captured:
         for given in conditions:
             image, cameras = captured_group(scene, size, given, views)
-            images = evaluate_group(model, image, cameras, given, sampler, (scene.name,))
+            images = evaluate_group(generator, image, cameras, given, sampler, (scene.name,))
             take((scene.name, ALL_CAPTURED), given, images)
             if pictures is not None:
                 _contact_sheet(pictures / f"{scene.name}_{given}.png", image[:given], images)
@@ -220,14 +208,15 @@ def evaluate_file(
     sampler: SamplerConfig = FEW_STEPS,
     pictures: Path | None = None,
     data: Path | None = None,
+    worlds: Path | None = None,
 ) -> str:
     """Markdown tables of PSNR, SSIM and (where weights are found) perceptual distance of a model file."""
     perceptual = find_perceptual()
-    model = load_model(path).to("cuda" if torch.cuda.is_available() else "cpu")
-    model.unet = model.unet.to(torch.bfloat16)
+    generator = cat3d.load(path, device(), "bfloat16")
     result = rows(
-        model, scenes, sampler=sampler, perceptual=perceptual, pictures=pictures, captured=captured_scenes(data)
-    )
+        generator, scenes, sampler=sampler, perceptual=perceptual, pictures=pictures,
+        captured=captured_scenes(data), worlds=worlds,
+    )  # fmt: skip
     return "\n\n".join(table(result, m) for m in ("psnr", "ssim", *([perceptual.name] if perceptual else [])))
 
 
@@ -238,10 +227,11 @@ def main() -> None:
     parser.add_argument("--many-steps", action="store_true", help="UniPC with 20 steps instead of DDIM with 4")
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--data", type=Path, help=f"folder with captured scenes: {', '.join(CAPTURED)}")
+    parser.add_argument("--worlds", type=Path, help="folder of held-out worlds (cat3d worlds PACKAGE --held-out DIR)")
     options = parser.parse_args()
     torch.set_num_threads(1)
     sampler = MANY_STEPS if options.many_steps else FEW_STEPS
-    print(evaluate_file(options.model, options.scenes, sampler, options.pictures, options.data))
+    print(evaluate_file(options.model, options.scenes, sampler, options.pictures, options.data, options.worlds))
 
 
 if __name__ == "__main__":

@@ -4,17 +4,12 @@ import pytest
 import torch
 
 from cat3d_core.diffusion import SIZES, GuidanceConfig, MultiViewModel, SamplerConfig
+from cat3d_core.generation import Cat3dGenerator
 from cat3d_core.metrics.psnr import psnr
 from cat3d_core.synthetic import FAMILIES
-from flows.bench.model import (
-    ALL_CAPTURED,
-    camera_distance,
-    captured_group,
-    held_out_group,
-    rows,
-    table,
-    warp,
-)
+from cat3d_core.synthetic.held_out import held_out_group
+from cat3d_core.view_selection import camera_distance
+from flows.training.evaluation import ALL_CAPTURED, captured_group, rows, table, warp
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -38,7 +33,7 @@ def test_rows_of_an_untrained_model():
     torch.manual_seed(0)
     model = MultiViewModel(SIZES["tiny"]).eval()
     sampler = SamplerConfig(steps=4, guidance=GuidanceConfig(scale=1.0))
-    result = rows(model, scenes_per_family=1, conditions=(3,), sampler=sampler)
+    result = rows(Cat3dGenerator(model), scenes_per_family=1, conditions=(3,), sampler=sampler)
     assert len(result) == 4 * (len(FAMILIES) + 1)
     assert {r["scenes"] for r in result if r["family"] == "all"} == {len(FAMILIES)}
     assert "| 3 | all |" in table(result)
@@ -55,7 +50,7 @@ def test_captured_scenes_are_scored_beside_the_procedural_ones(shared_data):
     assert (pixels - 32).abs().max() < 24
     model = MultiViewModel(SIZES["tiny"]).eval()
     sampler = SamplerConfig(steps=1, guidance=GuidanceConfig(scale=1.0))
-    result = rows(model, 0, (3,), sampler, captured=[shared_data / "llff_fern"])
+    result = rows(Cat3dGenerator(model), 0, (3,), sampler, captured=[shared_data / "llff_fern"])
     assert {r["family"] for r in result} == {"llff_fern", ALL_CAPTURED}
     assert {r["method"] for r in result} == {"sample", "nearest", "autoencoder"}
     assert f"| 3 | {ALL_CAPTURED} |" in table(result)

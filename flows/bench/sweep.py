@@ -1,0 +1,216 @@
+"""The plane sweep on the scenes of `flows/training/evaluation.py`: held-out procedural scenes and captured ones.
+
+For each target view of a group of 8 (M given, 8 - M targets), against its exact render or photograph:
+  nearest      the nearest given view, copied
+  sample       the shipped diffusion model's sample
+  sweep        what the photos show of it, as the plane sweep finds it
+  composite    the sweep where it is confident, the sample elsewhere
+  warp         the given views carried over by the target's true depth; holes keep `nearest` (procedural scenes)
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from cat3d_core.cameras import Cameras
+from cat3d_core.generation.advice import FEW_STEPS
+from cat3d_core.matching.checkpoint import load_sweep
+from cat3d_core.matching.composite import Composite
+from cat3d_core.matching.hint import Hint, hint, observe
+from cat3d_core.matching.network import SweepNetwork
+from cat3d_core.metrics.perceptual import PerceptualDistance, find_perceptual
+from cat3d_core.metrics.psnr import psnr
+from cat3d_core.metrics.ssim import ssim
+from cat3d_core.synthetic import FAMILIES
+from cat3d_core.synthetic.held_out import held_out_group
+from cat3d_core.weights import default_model_path
+from flows.generation.formats import cat3d
+from flows.training.evaluation import ALL_CAPTURED, captured_group, captured_scenes, evaluate_group, warped
+from flows.training.renders import save
+
+SIZE, VIEWS = 128, 8
+METHODS = ("nearest", "sample", "sweep", "composite", "warp")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One group: labels it counts under, `given` views of image (V, 3, H, W), normalised cameras, the pictures
+    (V - given, 3, H, W) of the methods that need no sweep, and the targets' inverse depth where it is known."""
+
+    labels: tuple[str, ...]
+    given: int
+    image: Tensor
+    cameras: Cameras
+    pictures: dict[str, Tensor]
+    inverse_depth: Tensor | None
+
+
+def cases(cache: Path, scenes: int, given: Sequence[int], data: Path | None) -> Iterator[Case]:
+    """Procedural scenes of each family, then captured ones. What takes long is kept in `cache`."""
+    for number in range(scenes):
+        for family in FAMILIES:
+            for m in given:
+                stored = _procedural(cache / f"{family}_{number:03d}_{m}.safetensors", family, number, m)
+                yield case((family, "all"), m, stored)
+    for scene in captured_scenes(data):
+        for m in given:
+            yield case((scene.name, ALL_CAPTURED), m, _captured(cache / f"{scene.name}_{m}.safetensors", scene, m))
+
+
+def case(labels: tuple[str, ...], given: int, stored: dict[str, Tensor]) -> Case:
+    """A group as it is kept in the cache (`sampled`)."""
+    stored = dict(stored)
+    image = stored.pop("image")
+    size = torch.tensor([[image.shape[-1], image.shape[-2]]]).repeat(len(image), 1)
+    cameras = Cameras(stored.pop("intrinsics"), stored.pop("world_from_camera"), size)
+    depth = stored.pop("inverse_depth", None)
+    return Case(labels, given, image, cameras, {k: t.float() for k, t in stored.items()}, depth)
+
+
+_MODEL: list[Any] = []
+
+
+def sampled(image: Tensor, cameras: Cameras, given: int, key: tuple) -> dict[str, Tensor]:
+    """`sample` and `nearest`, with the shipped model, which is loaded when it is first needed."""
+    if not _MODEL:
+        _MODEL.append(cat3d.load(default_model_path(), "cpu", "bfloat16"))
+    images = evaluate_group(_MODEL[0], image, cameras, given, FEW_STEPS, key)
+    return {name: images[name].half() for name in ("sample", "nearest")} | {
+        "image": image, "intrinsics": cameras.intrinsics, "world_from_camera": cameras.world_from_camera,
+    }  # fmt: skip
+
+
+def _procedural(path: Path, family: str, number: int, given: int) -> dict[str, Tensor]:
+    if not path.exists():
+        traced, cameras = held_out_group(family, number, SIZE, VIEWS)
+        parts = sampled(traced.image, cameras, given, (family, number))
+        save(path, parts | {"warp": warped(traced, cameras, given).half(), "inverse_depth": 1 / traced.depth[given:]})
+    return load_file(path)
+
+
+def _captured(path: Path, scene: Path, given: int) -> dict[str, Tensor]:
+    if not path.exists():
+        image, cameras = captured_group(scene, SIZE, given, VIEWS)
+        save(path, sampled(image, cameras, given, (scene.name,)))
+    return load_file(path)
+
+
+def swept(network: SweepNetwork, case: Case) -> Hint:
+    """What the given views show of the others."""
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        observed = observe(network, case.image[: case.given], case.cameras[slice(0, case.given)])
+        return hint(network, observed, case.cameras[slice(case.given, None)])
+
+
+def scores(
+    network: SweepNetwork, found: Iterator[Case], composite: Composite, perceptual: PerceptualDistance | None
+) -> list[dict[str, Any]]:
+    """One row per label, number of given views and method: means over groups of PSNR, SSIM and perceptual distance;
+    with the method `sweep`, also over its confident pixels (> 0.5) and the error of inverse depth."""
+    rows: dict[tuple[str, int, str], list[dict[str, float]]] = defaultdict(list)
+    for case in found:
+        h, truth = swept(network, case), case.image[case.given :]
+        pictures = case.pictures | {
+            "sweep": h.colour, "composite": composite(h.colour, h.confidence, case.pictures["sample"]),
+        }  # fmt: skip
+        for method, picture in pictures.items():
+            score = {"psnr": float(psnr(picture, truth).mean()), "ssim": float(ssim(picture, truth).mean())}
+            if perceptual is not None:
+                score[perceptual.name] = float(perceptual(picture, truth).mean())
+            score |= _confident(picture, truth, h.confidence)
+            if method == "sweep":
+                score |= {"confidence": float(h.confidence.mean())} | _calibration(picture, truth, h.confidence)
+                if case.inverse_depth is not None:
+                    score["depth_error"] = float((h.inverse_depth - case.inverse_depth).abs().mean())
+            for label in case.labels:
+                rows[label, case.given, method].append(score)
+    out = []
+    for (label, given, method), several in rows.items():
+        names = dict.fromkeys(name for s in several for name in s)
+        means = {n: round(_mean([s[n] for s in several if n in s]), 4) for n in names}
+        out.append({"label": label, "given": given, "method": method, "groups": len(several), **means})
+    return out
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / max(len(values), 1)
+
+
+def _confident(picture: Tensor, truth: Tensor, confidence: Tensor) -> dict[str, float]:
+    """PSNR over the pixels that the sweep is confident of, and over the others, where there are some."""
+    error = (picture.clamp(0, 1) - truth).square().mean(1)
+    out = {}
+    for name, mask in (("psnr_confident", confidence > 0.5), ("psnr_other", confidence <= 0.5)):
+        if int(mask.sum()) > 64:
+            out[name] = float(-10 * error[mask].mean().clamp(min=1e-8).log10())
+    return out
+
+
+def _calibration(picture: Tensor, truth: Tensor, confidence: Tensor) -> dict[str, float]:
+    """Mean of what confidence foretells, exp(-error / 0.06), at low, middle and high confidence."""
+    right = torch.exp(-(picture - truth).abs().mean(1) / 0.06)
+    out = {}
+    for name, low, high in (("low", 0.0, 1 / 3), ("middle", 1 / 3, 2 / 3), ("high", 2 / 3, 1.01)):
+        mask = (confidence >= low) & (confidence < high)
+        if int(mask.sum()) > 64:
+            out[f"right_{name}"], out[f"said_{name}"] = float(right[mask].mean()), float(confidence[mask].mean())
+    return out
+
+
+def table(rows: list[dict[str, Any]], perceptual: str | None) -> str:
+    """Markdown: a line per number of given views and label; PSNR / SSIM / perceptual distance of each method."""
+    lines = ["| given | scenes | " + " | ".join(METHODS) + " |", "|---" * (len(METHODS) + 2) + "|"]
+    at = {(r["label"], r["given"], r["method"]): r for r in rows}
+    for given in sorted({r["given"] for r in rows}, reverse=True):
+        for label in dict.fromkeys(r["label"] for r in sorted(rows, key=lambda r: r["label"].startswith("all"))):
+            cells = []
+            for method in METHODS:
+                r = at.get((label, given, method))
+                cells.append(
+                    ""
+                    if r is None
+                    else f"{r['psnr']:.2f} / {r['ssim']:.2f}" + (f" / {r[perceptual]:.2f}" if perceptual else "")
+                )
+            lines.append(f"| {given} | {label} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("network", type=Path, nargs="?", help="the sweep's weights; none: only fill the cache")
+    parser.add_argument("--scenes", type=int, default=20, help="held-out scenes per family")
+    parser.add_argument("--given", type=int, nargs="+", default=[3, 1])
+    parser.add_argument("--data", type=Path, help="folder with captured scenes")
+    parser.add_argument("--cache", type=Path, default=Path("outputs/bench_sweep"))
+    parser.add_argument("--json", type=Path, help="where the rows go")
+    parser.add_argument("--captured-only", action="store_true")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    options.cache.mkdir(parents=True, exist_ok=True)
+    found = cases(options.cache, 0 if options.captured_only else options.scenes, options.given, options.data)
+    if options.network is None:
+        for _ in found:
+            pass
+        return
+    network, perceptual = load_sweep(options.network), find_perceptual()
+    rows = scores(network, found, network.composite, perceptual)
+    if options.json:
+        options.json.write_text(json.dumps(rows))
+    print(table(rows, perceptual.name if perceptual else None))
+    for r in rows:
+        if r["label"].startswith("all"):
+            print(json.dumps(r))
+
+
+if __name__ == "__main__":
+    main()
