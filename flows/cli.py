@@ -106,26 +106,17 @@ def inspect(
 def export(
     store: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder) with a finished run.")],
     run_name: Annotated[str | None, typer.Option("--run", help="The run, where the store has several.")] = None,
-    what: Annotated[
-        str, typer.Option(help="mesh, points, splats, dataset, renders; with commas. All but renders if not given.")
-    ] = "",
+    what: Annotated[str, typer.Option(help="mesh, points, splats, dataset, renders; default: all but renders.")] = "",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the exports.")] = Path("exports"),
-    frame: Annotated[
-        str, typer.Option(help="Coordinates: world is the data set's own; scene is normalised, +z up.")
-    ] = "world",
+    frame: Annotated[str, typer.Option(help="world: the data set's own; scene: normalised, +z up.")] = "world",
     resolution: Annotated[int, typer.Option(help="Voxels along each side of the mesh's cube.")] = 512,
-    radius: Annotated[
-        float, typer.Option(help="What counts as surface, in mean distances from the cameras to what they look at.")
-    ] = 3.0,
+    radius: Annotated[float, typer.Option(help="How far a surface reaches, in mean distances of the cameras.")] = 3.0,
     opacity: Annotated[float, typer.Option(help="Least opacity of a pixel that counts as surface.")] = 0.5,
     views: Annotated[int, typer.Option(help="Cameras to render for mesh, points and splats, at most.")] = 120,
     scale: Annotated[float, typer.Option(help="Their size relative to the photos.")] = 1.0,
     splats: Annotated[int, typer.Option(help="Splats, at most.")] = 200_000,
     refine: Annotated[int, typer.Option(help="Steps in which splats learn to look like the renders.")] = 500,
-    path: Annotated[
-        Path | None,
-        typer.Option(help='Renders along it: JSON list of {"world_from_camera": 4x4, "fov": degrees}, in --frame.'),
-    ] = None,
+    path: Annotated[Path | None, typer.Option(help="Renders along it: a JSON path (docs/guides/viewing.md).")] = None,
 ) -> None:
     """A finished run as a mesh (PLY, GLB), points, splats (PLY, SPLAT, SPZ), a data set, or renders along any path."""
     from flows.commands.export import SurfaceSettings, export_command

@@ -16,12 +16,12 @@ from cat3d_core.rays import image_rays
 from cat3d_core.reconstruction import Render, normals_from_depth
 from cat3d_core.splats import Gaussians
 from flows.errors import InputError
+from flows.exports.preview import kept_preview
 from flows.exports.splat_files import write_splat
 from flows.exports.splats import splats_of
 from flows.jobs.access import read_cameras
 from flows.reconstruction.stored import read_reconstruction
-from flows.viewer.content import ShownView, captured_views, planned_views
-from flows.viewer.preview import kept_preview
+from flows.reporting.content import ShownView, captured_views, planned_views
 from schemas.errors import StoreError
 from schemas.scene_store import Run, SceneStore, Section
 

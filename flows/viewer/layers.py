@@ -10,8 +10,8 @@ import viser
 
 from cat3d_core.splats import Gaussians
 from flows.media.images import resize
+from flows.reporting.content import ShownView
 from flows.viewer.cameras import aspect, place, vertical_fov
-from flows.viewer.content import ShownView
 
 THUMBNAIL = 96
 """Longer side in pixels of a frustum's picture."""

@@ -4,38 +4,51 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
+import viser
 
 from cat3d_core.cameras import Cameras
 from flows.errors import InputError, describe
 from flows.exports.path import parse_path
-from flows.viewer.content import ShownView
+from flows.reporting.content import ShownView
 from flows.viewer.keyframes import FPS, as_bytes, nerfstudio_document, path_document, smooth_path
 from flows.viewer.ladder import CHANNELS
 from flows.viewer.layers import side_by_side
-
-if TYPE_CHECKING:
-    from flows.viewer.server import OpenRun
-    from flows.viewer.session import Session
+from flows.viewer.run import OpenRun, Runs
 
 LAYERS = ("reconstruction", "splats", "points", "captured", "held out", "generated", "planned", "path")
 NOTHING = "nothing"
 SECONDS_A_KEYFRAME = 2.0
 
 
+class Sight(Protocol):
+    """What the panel steers: what one browser sees."""
+
+    client: viser.ClientHandle
+    runs: Runs
+    run: OpenRun | None
+
+    def open(self, run: OpenRun) -> None: ...
+    def moved(self) -> None: ...
+    def shown(self) -> None: ...
+    def camera(self) -> Cameras | None: ...
+    def fly(self, camera: Cameras) -> None: ...
+    def say(self, text: str) -> None: ...
+
+
 class Panel:
     """The controls, one browser's own."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Sight) -> None:
         self.session = session
         self.keyframes: list[Cameras] = []
         gui = session.client.gui
-        self._table, self._names = None, list(session.viewer.names)
-        if session.viewer.table is not None:
+        self._table, self._names = None, list(session.runs.names)
+        if session.runs.table is not None:
             with gui.add_folder("Results"):
-                table = session.viewer.table
+                table = session.runs.table
                 sort = gui.add_dropdown("Sort by", table.columns)
                 rising = gui.add_checkbox("Rising", True)
                 self._table = gui.add_html(table.html(table.columns[0], True))
@@ -106,13 +119,13 @@ class Panel:
         if name in (NOTHING, self._run.value):
             return None
         try:
-            return self.session.viewer.opened(name)
+            return self.session.runs.opened(name)
         except Exception as error:
             self.session.say(describe(error) or str(error))
             return None
 
     def _open(self, name: str) -> None:
-        self._guarded(lambda: self.session.open(self.session.viewer.opened(name)))
+        self._guarded(lambda: self.session.open(self.session.runs.opened(name)))
 
     def opened(self) -> None:
         """Say what the run is and how far it has come."""
@@ -124,7 +137,7 @@ class Panel:
         self._state.content = run.state()
 
     def _sort(self, column: str, rising: bool) -> None:
-        table = self.session.viewer.table
+        table = self.session.runs.table
         if table is not None and self._table is not None:
             self._table.content = table.html(column, rising)
 

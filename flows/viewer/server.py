@@ -5,85 +5,23 @@ from __future__ import annotations
 import contextlib
 import threading
 import traceback
-from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 import viser
 
-from cat3d_core.cameras import Cameras
-from cat3d_core.normalization import Similarity
-from cat3d_core.reconstruction import Reconstructor
-from cat3d_core.splats import Gaussians
 from flows.errors import InputError, describe
-from flows.jobs.access import read_similarity
-from flows.viewer import content
-from flows.viewer.content import Shape, ShownView
+from flows.exports.preview import make_preview
+from flows.reporting import content
 from flows.viewer.folder import ResultTable, result_table
 from flows.viewer.ladder import Ladder, Picture, Wish
-from flows.viewer.preview import kept_preview, make_preview
+from flows.viewer.run import OpenRun
 from flows.viewer.session import Session
 from schemas.errors import StoreError
-from schemas.scene_store import Run, SceneStore
+from schemas.scene_store import SceneStore
 
 HOST = "127.0.0.1"
 POLL = 2.0
 """Seconds between two looks at the stores that someone watches."""
-
-
-@dataclass
-class OpenRun:
-    """A run that someone looks at. `frame_from_scene`: to the data set's own world."""
-
-    name: str
-    store: SceneStore
-    run: Run
-    views: list[ShownView] = field(default_factory=list)
-    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.float32))
-    scene: Reconstructor | None = None
-    splats: Gaussians | None = None
-    shape: Shape | None = None
-    frame_from_scene: Similarity | None = None
-    problem: str = ""
-
-    def read(self) -> None:
-        """Read what there is, as far as the run has come."""
-        shape = content.shape_of(self.store, self.run)
-        old, self.shape = self.shape, shape
-        self.views = [*content.captured_views(self.store, self.run), *content.planned_views(self.run)]
-        self.points = content.scene_points(self.store)
-        if self.frame_from_scene is None and "similarity" in self.store.captured.attrs:
-            self.frame_from_scene = read_similarity(self.store).inverse()
-        trained = (shape.stages[-1], shape.checkpoint)
-        if old is None or trained != (old.stages[-1], old.checkpoint):
-            self.problem = ""
-            try:
-                self.scene = content.reconstruction(self.store, self.run)
-            except (InputError, StoreError) as error:
-                self.problem = str(error)
-            self.splats = kept_preview(self.store, self.run)
-
-    @property
-    def cameras(self) -> Cameras | None:
-        """Those of all its views."""
-        return Cameras.cat([view.camera for view in self.views]) if self.views else None
-
-    def state(self) -> str:
-        """How far it has come, in a sentence or two."""
-        kinds = [view.kind for view in self.views]
-        parts = [f"{kinds.count('train')} captured views, {kinds.count('test')} held out"]
-        if "planned" in kinds or "generated" in kinds:
-            generated = kinds.count("generated")
-            parts.append(f"{generated} of {kinds.count('planned') + generated} generated")
-        done = self.shape is not None and bool(self.shape.stages[-1][1])
-        parts.append(
-            "reconstructed" if done else "being trained" if self.scene is not None else "not reconstructed yet"
-        )
-        if self.splats is not None:
-            parts.append(f"{len(self.splats)} splats")
-        elif self.scene is not None:
-            parts.append("splats are being made")
-        return f"{'; '.join(parts)}. {self.problem}".strip()
 
 
 class Viewer:
@@ -137,7 +75,7 @@ class Viewer:
             return self._open[name]
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        session = Session(self, client)
+        session = Session(self, self.ladder, client)
         self.sessions[client.client_id] = session
         try:
             session.open(self.opened(self.first))

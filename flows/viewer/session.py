@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,14 +13,12 @@ import viser
 from cat3d_core.cameras import Cameras
 from flows.errors import describe
 from flows.media.images import to_uint8
+from flows.reporting.content import ShownView
 from flows.viewer import layers
 from flows.viewer.cameras import camera_of, place, vertical_fov
-from flows.viewer.content import ShownView
-from flows.viewer.ladder import Picture, Wish
+from flows.viewer.ladder import Ladder, Picture, Wish
 from flows.viewer.panel import Panel
-
-if TYPE_CHECKING:
-    from flows.viewer.server import OpenRun, Viewer
+from flows.viewer.run import OpenRun, Runs
 
 REST = 0.25
 """Seconds without a move after which a camera rests."""
@@ -31,8 +29,8 @@ FRUSTUM = 0.12
 class Session:
     """One browser. Its callbacks come from viser's threads, its pictures from the ladder's: a lock keeps them apart."""
 
-    def __init__(self, viewer: Viewer, client: viser.ClientHandle) -> None:
-        self.viewer, self.client = viewer, client
+    def __init__(self, runs: Runs, ladder: Ladder, client: viser.ClientHandle) -> None:
+        self.runs, self.ladder, self.client = runs, ladder, client
         self.run: OpenRun | None = None
         self._lock = threading.RLock()
         self._views: dict[str, list[Any]] = {}
@@ -47,11 +45,11 @@ class Session:
         """Forget the browser."""
         if self._timer is not None:
             self._timer.cancel()
-        self.viewer.ladder.look(self.client.client_id, None)
+        self.ladder.look(self.client.client_id, None)
 
     # What there is to see
 
-    def open(self, run: OpenRun, fly: bool = True) -> None:
+    def open(self, run: OpenRun) -> None:
         """Show another run, from its first captured view."""
         with self._lock:
             self.run = run
@@ -60,7 +58,7 @@ class Session:
             self.draw()
             self.panel.opened()
             first = next(iter(run.views), None)
-            if fly and first is not None:
+            if first is not None:
                 self.fly(first.camera)
         self.moved()
 
@@ -112,7 +110,7 @@ class Session:
 
     def moved(self) -> None:
         """The camera moves, or what it looks at changes: splats until it rests, then the reconstruction itself."""
-        self.viewer.ladder.look(self.client.client_id, None)
+        self.ladder.look(self.client.client_id, None)
         with self._lock:
             if self._resting:
                 self._resting, self.shown_picture = False, None
@@ -131,7 +129,7 @@ class Session:
             return
         other = self.panel.compared()
         wish = Wish(camera, self.panel.channel, run.scene, other.scene if other else None, self.panel.split)
-        self.viewer.ladder.look(self.client.client_id, wish)
+        self.ladder.look(self.client.client_id, wish)
 
     def picture(self, wish: Wish, picture: Picture) -> None:
         """Show what the ladder rendered, with its depth, so that frusta before it stay visible."""

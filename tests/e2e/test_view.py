@@ -149,9 +149,9 @@ def test_moving_shows_splats_and_two_browsers_do_not_disturb_each_other(viewer: 
 
 def test_keyframes_become_paths_that_export_reads(store: Path, tmp_path: Path) -> None:
     """Ours and nerfstudio's say the same cameras, in the frame of the data set."""
-    from flows.viewer.content import captured_views
+    from flows.reporting.content import captured_views
     from flows.viewer.keyframes import smooth_path
-    from flows.viewer.server import OpenRun
+    from flows.viewer.run import OpenRun
     from schemas.scene_store import SceneStore
 
     opened_store = SceneStore.open(store)
