@@ -63,7 +63,10 @@ def _warn(problem: str) -> None:
 
 
 def library(name: str) -> ctypes.CDLL | None:
-    """The kernels of NAME.cpp; compiles them at the first call. None where that fails, with one warning."""
+    """The kernels of the core's NAME.cpp, such as "zipnerf/hash_grid"; compiles them at the first call.
+
+    None where that fails, with one warning.
+    """
     found = _load(name)
     if isinstance(found, str):
         _warn(found)

@@ -114,28 +114,23 @@ def export(
     store: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder) with a finished run.")],
     run_name: Annotated[str | None, typer.Option("--run", help="The run, where the store has several.")] = None,
     what: Annotated[
-        str, typer.Option(help="mesh, points, dataset (these if not given), renders, plan; by commas.")
+        str, typer.Option(help="mesh, points, splats, dataset (these if not given), renders, plan; by commas.")
     ] = "",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the exports.")] = Path("exports"),
-    frame: Annotated[
-        str, typer.Option(help="Coordinates: world is the data set's own; scene is normalised, +z up.")
-    ] = "world",
+    frame: Annotated[str, typer.Option(help="world: the data set's own; scene: normalised, +z up.")] = "world",
     resolution: Annotated[int, typer.Option(help="Voxels along each side of the mesh's cube.")] = 512,
-    radius: Annotated[
-        float, typer.Option(help="What counts as surface, in mean distances from the cameras to what they look at.")
-    ] = 3.0,
+    radius: Annotated[float, typer.Option(help="How far a surface reaches, in mean distances of the cameras.")] = 3.0,
     opacity: Annotated[float, typer.Option(help="Least opacity of a pixel that counts as surface.")] = 0.5,
-    views: Annotated[int, typer.Option(help="Cameras to render for mesh and points, at most.")] = 120,
+    views: Annotated[int, typer.Option(help="Cameras to render for mesh, points and splats, at most.")] = 120,
     scale: Annotated[float, typer.Option(help="Their size relative to the photos.")] = 1.0,
-    path: Annotated[
-        Path | None,
-        typer.Option(help='Renders along it: JSON list of {"world_from_camera": 4x4, "fov": degrees}, in --frame.'),
-    ] = None,
+    splats: Annotated[int, typer.Option(help="Splats, at most.")] = 200_000,
+    refine: Annotated[int, typer.Option(help="Steps in which splats learn to look like the renders.")] = 500,
+    path: Annotated[Path | None, typer.Option(help="Renders along it: a JSON path (docs/guides/viewing.md).")] = None,
 ) -> None:
-    """A finished run as a mesh (PLY, GLB), points, a nerfstudio and COLMAP data set, or renders along any path."""
+    """A finished run as a mesh (PLY, GLB), points, splats (PLY, SPLAT, SPZ), a data set, or renders along any path."""
     from flows.commands.export import SurfaceSettings, export_command
 
-    settings = SurfaceSettings(resolution, radius, opacity, views, scale)
+    settings = SurfaceSettings(resolution, radius, opacity, views, scale, splats, refine)
     export_command(store, run_name, what, out, frame, settings, path)
 
 
@@ -154,6 +149,18 @@ def import_views(
     if forget == (folder is not None):
         raise typer.BadParameter("Give a folder of pictures, or --forget.")
     import_views_command(store, folder, run_name, note, partial)
+
+
+@app.command()
+def view(
+    path: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder), or the folder of a run or sweep.")],
+    run_name: Annotated[str | None, typer.Option("--run", help="The run to begin with.")] = None,
+    port: Annotated[int, typer.Option(help="Where it is served, on 127.0.0.1.")] = 8080,
+) -> None:
+    """Look at scenes in the browser: cameras, pictures, splats, the field itself; also while they are being made."""
+    from flows.commands.view import view_command
+
+    view_command(path, run_name, port)
 
 
 @app.command()

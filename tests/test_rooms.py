@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 STDLIB = sys.stdlib_module_names
 ALLOWED = {
-    "cat3d_core": {"torch", "numpy", "safetensors", "triton", "cat3d_core"},  # triton: guarded, GPU kernels only
+    "cat3d_core": {"torch", "numpy", "safetensors", "triton", "gsplat", "cat3d_core"},  # triton, gsplat: guarded
     "schemas": {"zarr", "numcodecs", "pyarrow", "pydantic", "yaml", "numpy", "schemas"},
 }
 PACKAGES = (*ALLOWED, "flows")

@@ -19,7 +19,7 @@ from cat3d_core.generation.advice import MEASURED
 from cat3d_core.metrics.perceptual import find_perceptual
 from cat3d_core.weights import default_model_path
 from cat3d_core.zipnerf import PRESETS
-from flows.bench import cameras, metrics, plan, poses, reconstruct, sampler, scenes, skips, store, synthetic
+from flows.bench import cameras, metrics, plan, poses, reconstruct, sampler, scenes, skips, splats, store, synthetic
 from flows.errors import InputError
 from flows.generation.formats import cat3d
 from flows.media.images import read_image
@@ -214,6 +214,15 @@ def synthetic_rows(quick: bool, data: Path | None) -> list[Row]:
     return synthetic.rows(64, 8, 1) if quick else synthetic.rows()
 
 
+def splat_rows(quick: bool, data: Path | None) -> list[Row]:
+    """The rasteriser's speed, splats of fields, and both reconstructors on few views."""
+    if quick:
+        families = ("co3d",)
+        rows = splats.kernel_rows(1, (1,)) + splats.conversion_rows(families, size=32, steps=60)
+        return rows + splats.method_rows(families, (3,), (0,), (("splats", "tiny"),), size=32)
+    return splats.kernel_rows() + splats.conversion_rows() + splats.method_rows()
+
+
 _SAMPLER_POINT = {"series": ("solver", "nodes"), "label": ("steps", "dtype"), "each": ("interval",)}
 BENCHES: dict[str, Bench] = {
     "sampler": Bench(
@@ -270,6 +279,12 @@ BENCHES: dict[str, Bench] = {
         "time and quality of whole runs with nothing skipped, each skip alone, the defaults, and everything skipped",
         skip_rows,
         (Panel("Skips", "cpu_seconds", "psnr_db", ("variant",), each=("set",), where=(("scene", "mean"),),
+               higher_is_better=True),),
+    ),
+    "splats": Bench(
+        "the rasteriser beside plain torch, splats of a field beside the field, splats beside zipnerf on few views",
+        splat_rows,
+        (Panel("Reconstructors", "cpu_s", "psnr", ("method",), ("preset", "seed"), ("family", "views"),
                higher_is_better=True),),
     ),
     "synthetic": Bench("procedural scenes rendered: views a second per family", synthetic_rows),

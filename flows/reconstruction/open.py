@@ -15,7 +15,7 @@ from schemas.errors import ConfigError
 
 GROUP = "cat3d.reconstructors"
 #: Our own, by name: module and class, imported when asked for.
-OWN = {"zipnerf": "cat3d_core.zipnerf:ZipNerf"}
+OWN = {"zipnerf": "cat3d_core.zipnerf:ZipNerf", "splats": "cat3d_core.splats:Splats"}
 
 
 def reconstructor_class(name: str) -> type[Reconstructor]:

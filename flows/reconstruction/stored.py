@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import torch
 from safetensors import safe_open
@@ -60,11 +61,16 @@ def read_reconstruction(store: SceneStore, run: Run) -> Reconstructor:
         ) from None
 
 
+def checkpoint_path(out: Path, scene_id: str, run: str) -> Path:
+    """Where the state of a run's reconstruction is while it is under way."""
+    return out / ".work" / f"{scene_id}-{run}.safetensors"
+
+
 class Checkpoint:
     """The state of a reconstruction on disk while the stage runs, beside the store, replaced atomically."""
 
     def __init__(self, job: Job, key: str) -> None:
-        self.path = job.out / ".work" / f"{job.scene_id}-{job.run}.safetensors"
+        self.path = checkpoint_path(job.out, job.scene_id, job.run)
         self.key = key  # only a step with the same inputs and settings may go on from it
 
     def save(self, state: dict[str, torch.Tensor]) -> None:

@@ -36,6 +36,7 @@ from flows.reporting.summary import (
     timing_rows,
     title,
 )
+from flows.reporting.turning import PAGE_BYTES, turning_scene
 from flows.stages import STAGES
 from schemas.scene_store import Run, SceneStore
 from schemas.tables import TIMINGS, read_rows
@@ -53,6 +54,7 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
     if only_if_changed and page.exists():
         return page
     scenes = [scene_section(out, path) for path in sorted(out.glob("*.zarr"))]
+    embed_scenes(out, scenes)
     rows, timings = summary_rows(out), timing_rows(out)
     tables = paper_tables(rows)
     sweep = _document(out / SWEEP) or {}
@@ -134,6 +136,20 @@ def scene_section(out: Path, path: Path) -> dict[str, Any]:
             }
         )
     return {"id": store.scene_id, "dataset": store.dataset, "runs": runs, "provenance": store.attrs["provenance"]}
+
+
+def embed_scenes(out: Path, scenes: Sequence[dict[str, Any]]) -> None:
+    """Add to the first run of each scene what one needs to turn it in the page, as far as there is room; then to the
+    further runs."""
+    room = PAGE_BYTES
+    for rank in range(max((len(scene["runs"]) for scene in scenes), default=0)):
+        for scene in scenes:
+            if rank < len(scene["runs"]):
+                run = scene["runs"][rank]
+                store = SceneStore.open(out / f"{scene['id']}.zarr")
+                found = turning_scene(store, store.run(run["name"]), room)
+                run["turning"] = found
+                room -= found.get("bytes", 0) if found else 0
 
 
 def _run_order(name: str) -> tuple:
