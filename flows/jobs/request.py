@@ -48,7 +48,10 @@ class Request:
                 check_solver(self.config.sample.solver)
             except ValueError as error:
                 raise ConfigError(f"sample.solver: {error}") from None
-        scene = scene or Scene(source_text(self.source), self.reader, self.image_folder, self.config.ingest.frames)
+        text = source_text(absolute(self.source))
+        scene = scene or Scene(text, self.reader, self.image_folder, self.config.ingest.frames)
+            source_text(absolute(self.source)), self.reader, self.image_folder, self.config.ingest.frames
+        )
         jobs = []
         for split in self.views:
             job = Job(
@@ -66,6 +69,12 @@ class Request:
                 job = job.model_copy(update={"config": config})
             jobs.append(job)
         return jobs
+
+
+def absolute(source: str) -> str:
+    """A folder or file as it is found from anywhere, so that a store can be looked at from another folder; what is no
+    path that exists, such as procedural:llff/1, stays."""
+    return str(Path(source).absolute()) if Path(source).exists() else source
 
 
 def make_request(
