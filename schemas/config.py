@@ -145,9 +145,9 @@ class ReconstructConfig(_Model):
     """Fitting the field (paper, section 3.3)."""
 
     method: str = "zipnerf"
-    """Name of the reconstructor: zipnerf, or that of an installed package."""
+    """Name of the reconstructor: zipnerf, splats, or that of an installed package."""
     preset: str = "fast"
-    """Point on the measured front of quality against time; zipnerf has tiny, fast, balanced and paper."""
+    """Point on the measured front of quality against time; zipnerf and splats have tiny, fast, balanced and paper."""
     overrides: dict[str, Any] = Field(default_factory=dict)
     """Settings of the trainer that replace the preset's."""
 

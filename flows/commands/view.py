@@ -12,7 +12,7 @@ from flows.progress import console
 def view_command(path: Path, run: str | None, port: int) -> None:
     """Serve a store or a folder of stores on the loopback address until Ctrl-C.
 
-    Raises InputError where there is nothing to see or the port cannot be used.
+    Raises InputError where there is nothing to see.
     """
     try:
         from flows.viewer.server import Viewer
@@ -21,6 +21,8 @@ def view_command(path: Path, run: str | None, port: int) -> None:
     if not 0 < port < 65536:
         raise InputError(f"--port is {port}; it must lie between 1 and 65535.")
     viewer = Viewer(path, run, port)
+    if viewer.port != port:
+        console.print(f"The port {port} is taken; this is the next free one.")
     console.print(f"http://127.0.0.1:{viewer.port}  shows {viewer.first}; Ctrl-C ends it.")
     try:
         while True:

@@ -50,8 +50,6 @@ class Request:
                 raise ConfigError(f"sample.solver: {error}") from None
         text = source_text(absolute(self.source))
         scene = scene or Scene(text, self.reader, self.image_folder, self.config.ingest.frames)
-            source_text(absolute(self.source)), self.reader, self.image_folder, self.config.ingest.frames
-        )
         jobs = []
         for split in self.views:
             job = Job(

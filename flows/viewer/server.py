@@ -44,11 +44,7 @@ class Viewer:
         self._stopped = threading.Event()
         self.sessions: dict[int, Session] = {}
         self.ladder = Ladder(self._picture)
-        try:
-            self.server = viser.ViserServer(host=HOST, port=port, label="cat3d", verbose=False)
-        except OSError as error:
-            self.ladder.stop()
-            raise InputError(f"The port {port} cannot be used ({error}); choose another one with --port.") from None
+        self.server = viser.ViserServer(host=HOST, port=port, label="cat3d", verbose=False)  # or the next free port
         self.port = self.server.get_port()
         self.server.scene.set_up_direction("+z")
         self.server.on_client_connect(self._connected)
