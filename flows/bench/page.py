@@ -1,4 +1,4 @@
-"""The page of all benchmarks, from the Parquet tables of their last runs: Markdown and one picture of the fronts."""
+"""The page of all benchmarks, from the Parquet tables of their last runs: Markdown, and each with a picture."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from schemas.errors import StoreError
 #: Columns that say where and when rows were measured; each benchmark has one value of them.
 RUN_COLUMNS = ("bench", "quick", "machine", "date", "load", "bench_seconds", "versions")
 MOST_ROWS = 40
-COLUMNS = 3
+COLUMNS = 2
 
 
 def read_benches(folder: Path) -> dict[str, list[Row]]:
@@ -35,22 +35,23 @@ def read_benches(folder: Path) -> dict[str, list[Row]]:
 
 
 def write_page(page: Path, folder: Path) -> None:
-    """Write the Markdown `page` and the picture `folder/fronts.png` from the tables in `folder`."""
+    """Write the Markdown `page` and a picture `folder/NAME.png` for each benchmark from the tables in `folder`."""
     benches = {name: rows for name, rows in read_benches(folder).items() if rows}
     drawn = {name: panels_of(name, rows) for name, rows in benches.items()}
-    panels = [panel for found in drawn.values() for panel in found]
     lines = ["# Benchmarks", "", f"Written by `cat3d bench` from the tables in `{folder.name}/`; don't edit.", ""]
-    if panels:
-        _draw(panels, folder / "fronts.png")
+    if any(drawn.values()):
         lines += [
-            f"![Cost against error or quality for each stage]({folder.name}/fronts.png)", "",
-            "Lines are the fronts: what no other setting beats in both cost and value. Stars are the defaults.", "",
+            "In the pictures a line is a front: what no other setting beats in both cost and value. A star is",
+            "the default, gold where it lies on the front.", "",
         ]  # fmt: skip
     for name, rows in benches.items():
         run = rows[0]
         size = ", the small sizes of `--quick`" if run["quick"] else ""
         lines += [f"## {name}", "", f"{_sentence(BENCHES[name].summary)}", ""]
         lines += [f"*{run['machine']}; {run['date']}; {run['load']}; {run['bench_seconds']:.0f} s{size}.*", ""]
+        if drawn[name]:
+            _draw(drawn[name], folder / f"{name}.png")
+            lines += [f"![Cost against error or quality: {name}]({folder.name}/{name}.png)", ""]
         lines += [f"- {panel.title}: {text}" for panel in drawn[name] for text in verdict(panel)]
         lines += [""] if drawn[name] else []
         shown = worth_showing(rows, drawn[name])
@@ -102,9 +103,10 @@ def _sentence(text: str) -> str:
 def _draw(panels: list[Drawn], path: Path) -> None:
     from matplotlib.figure import Figure
 
-    lines = math.ceil(len(panels) / COLUMNS)
-    figure = Figure(figsize=(5.2 * COLUMNS, 4.2 * lines), layout="constrained")
-    axes = figure.subplots(lines, COLUMNS, squeeze=False).flatten()
+    columns = min(COLUMNS, len(panels))
+    lines = math.ceil(len(panels) / columns)
+    figure = Figure(figsize=(5.6 * columns, 4.4 * lines), layout="constrained")
+    axes = figure.subplots(lines, columns, squeeze=False).flatten()
     for axis in axes[len(panels) :]:
         axis.axis("off")
     for axis, drawn in zip(axes, panels):
@@ -125,9 +127,9 @@ def _draw(panels: list[Drawn], path: Path) -> None:
             )  # fmt: skip
         axis.set(title=drawn.title, xlabel=panel.cost, ylabel=panel.value)
         _scales(axis, drawn)
-        axis.tick_params(which="both", labelsize=6)
+        axis.tick_params(which="both", labelsize=8)
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=6)
+        axis.legend(fontsize=7)
     figure.savefig(path, dpi=100)
 
 

@@ -98,7 +98,7 @@ def gallery(scenes: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]) ->
     for scene in scenes[:SCENES_ON_TOP]:
         name = best.get(scene["id"])
         shown = {run["name"] for run in scene["runs"] if run["views"]}
-        if name in shown:
+        if name is not None and name in shown:
             rival = beside.get((scene["id"], name))
             out.append({"scene": scene["id"], "run": name, "rival": rival if rival in shown else None})
     return out

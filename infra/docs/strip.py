@@ -99,7 +99,7 @@ def picture_of(mesh: Mesh, camera, coloured: bool) -> np.ndarray:  # type: ignor
     """(H, W, 3) uint8 of the mesh, by casting one ray a pixel; a lamp stands at the camera."""
     from cat3d_core.rays import image_rays
 
-    o3d = import_open3d()
+    o3d = import_open3d("a picture of the mesh")
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
     rays = image_rays(camera, 0)

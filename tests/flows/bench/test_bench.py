@@ -108,7 +108,7 @@ def test_store_bench_for_real(tmp_path, monkeypatch):
     page = (tmp_path / "benchmarks.md").read_text()
     assert "## store" in page
     assert "default" in page
-    assert (tmp_path / "benchmarks" / "fronts.png").read_bytes()[:4] == b"\x89PNG"
+    assert (tmp_path / "benchmarks" / "store.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_photos_that_differ_in_size_are_cut_to_what_they_share(monkeypatch):
