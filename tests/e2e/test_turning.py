@@ -57,7 +57,8 @@ def test_a_browser_draws_the_splats_of_a_page_like_ours(tmp_path: Path) -> None:
         pose = json.dumps(c.world_from_camera[0].tolist())
         url = tab.run(
             "(() => { const scene = document.querySelector('canvas').scene;"
-            f"scene.look({pose}, {SIZE[1] / 2 / 200.0}); scene.draw(); return scene.canvas.toDataURL('image/png'); }})()"
+            f"scene.look({pose}, {SIZE[1] / 2 / 200.0}); scene.draw(); "
+            "return scene.canvas.toDataURL('image/png'); })()"
         )
         before = tab.run("document.querySelector('canvas').scene.turn")
         tab.drag((100, 100), (60, 10))
