@@ -90,7 +90,8 @@ class Plan:
     the sample to keep. groups: each view is a target of one. recipe: name. reasons: why, in sentences. frame: the scene
     as the plan saw it (None where an older program stored the plan). captured_count: V. captured_coverage,
     plan_coverage: before and after (captured and planned views together). needed: False where captured views cover the
-    path already (`PlanConfig.covered_share`): sample nothing.
+    path already (`PlanConfig.covered_share`): sample nothing. dropped: views of the path that add nothing to the
+    coverage and are not among the N.
     """
 
     cameras: Cameras
@@ -104,6 +105,7 @@ class Plan:
     captured_coverage: Coverage
     plan_coverage: Coverage
     needed: bool = True
+    dropped: int = 0
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -210,12 +212,12 @@ def make_plan(
             reasons.append(f"The path is not covered by captured views: {seen} ({config.covered_share:.0%} would do).")
         else:
             reasons.append(f"The path is covered, so its {len(poses)} views need not be generated: {seen}.")
+    dropped = 0
     if config.drop_by_coverage and needed:
         useful = gains(after, before) > 0
         if useful.any() and not useful.all():
-            reasons.append(
-                f"{int((~useful).sum())} of {len(useful)} views add nothing to the coverage and were dropped."
-            )
+            dropped = int((~useful).sum())
+            reasons.append(f"{dropped} of {len(useful)} views add nothing to the coverage and were dropped.")
             poses, path, after = poses[useful], path[useful], after[useful]
 
     samples = [_with_poses(captured, poses, kind, config.image_size) for kind in kinds]
@@ -236,6 +238,7 @@ def make_plan(
         captured_coverage=coverage(before),
         plan_coverage=coverage(torch.cat([before, after])),
         needed=needed,
+        dropped=dropped,
     )
 
 

@@ -125,12 +125,12 @@ def fitted(
         changes |= PATIENT if captured > FEW_VIEWS else {}
     # The rays that left out pixels of generated views would have had go to captured ones.
     changes |= {"captured_share": max(config.captured_share, left_out(views))}
+    kept = set(given)
     rays, why = enough_rays(config, int(views.counting.sum()), captured < len(views))
-    if skip.get("rays") and rays < config.batch_rays:
+    if skip.get("rays") and rays < config.batch_rays and "batch_rays" not in kept:
         changes |= {"batch_rays": rays}
         text = f"{rays} instead of {config.batch_rays} rays a step: {why}."
         decisions.append(Decision("skipped", text, "rays", {"rays_a_step": config.batch_rays - rays}))
-    kept = set(given)
     config = dataclasses.replace(config, **{n: v for n, v in changes.items() if n not in kept})
     smallest = int(views.size.min())
     if config.patch_size > smallest:

@@ -57,7 +57,8 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     missing = len(share.passes[0])
     label = f"decode {job.scene_id} {job.run}"
     totals = fan_out([share], job.config.execution, label, here=job.config.skip.workers)
-    return Outcome({"views": missing, "evaluations": missing} | totals.work(), decisions + totals.decisions)
+    counts = {"views": missing, "evaluations": missing} | totals.work()
+    return Outcome(counts, decisions + totals.decisions, totals.usage)
 
 
 def work(job: Job, store: SceneStore, key: str, items: Sequence[int]) -> None:

@@ -14,7 +14,7 @@ from flows.generation.plan import write_plan
 from flows.jobs.access import read_cameras, views_with_role
 from flows.jobs.job import Job, Outcome
 from flows.jobs.stage import Stage, generates, settings_of
-from schemas.decisions import chosen
+from schemas.decisions import chosen, skipped
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
 
@@ -52,6 +52,12 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     summary = f"{len(plan)} views of the trajectory {plan.recipe} in {len(plan.groups)} groups"
     decisions = [chosen(f"{summary}, {anchors} of them anchors." if anchors else f"{summary}.")]
     decisions += map(chosen, plan.reasons)
+    if plan.dropped:
+        text = "Views that add nothing to the coverage of the scene are not generated."
+        decisions.append(skipped(text, "coverage", views=plan.dropped))
+    if not plan.needed:
+        text = "No view is generated: captured views show what they would from nearly the same directions."
+        decisions.append(skipped(text, "covered_path", views=len(plan)))
     return Outcome({"views": len(plan), "groups": len(plan.groups)}, decisions)
 
 

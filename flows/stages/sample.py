@@ -75,7 +75,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     counts = {"views": sum(len(plan.groups[g].targets) for g in groups), "groups": len(groups)}
     spent = sum(group_cost(job, plan.groups[g], c).evaluations for g, c in zip(groups, configs, strict=True))
     counts |= {"steps": sum(c.steps for c in configs), "evaluations": spent}
-    return Outcome(counts | totals.work(), decisions)
+    return Outcome(counts | totals.work(), decisions, totals.usage)
 
 
 def sample_work(job: Job, store: SceneStore, key: str, passes: Sequence[Sequence[int]] | None = None) -> Work:
@@ -120,6 +120,11 @@ def sampler_decisions(job: Job, plan: StoredPlan, groups: Sequence[int]) -> list
     spared = group_cost(job, first, everywhere).evaluations - full
     how = f"guided by {scale:g} in {guided} of them" if guided else "without guidance"
     out = [chosen(f"{full} evaluations of the network a group: {config.steps} steps of {config.solver}, {how}.")]
+    whole = sampler_config(job, shortened=False)
+    shorter = group_cost(job, first, whole).evaluations - full
+    if shorter > 0:
+        text = f"{config.steps} steps of {config.solver} in place of {whole.steps} of {whole.solver}."
+        out.append(skipped(text, "solver", evaluations=shorter * len(groups)))
     if spared:
         text = f"Skipped the unconditional half in {spared} steps: guidance is on at log-SNR from "
         text += f"{config.guidance.low_log_snr:g} to {config.guidance.high_log_snr:g}."

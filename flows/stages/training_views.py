@@ -44,7 +44,7 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
         images += [view.image for view in made]
         if not made:
             text = "Trained on captured views alone, without the LPIPS loss: no view was generated."
-            decisions.append(skipped(text, "covered_path"))
+            decisions.append(skipped(text))
     captured = torch.arange(len(cameras)) < len(train)
     maps = hint_maps(len(train), made)
     views, more = unseen_alone(job, Views.from_images(cameras, images, captured, **maps))
