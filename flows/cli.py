@@ -72,9 +72,7 @@ def plan(
     source: Annotated[str, typer.Argument(help="A scene's folder, or procedural:FAMILY/SEED.")],
     out: OutOption = Path("outputs"),
     views: Annotated[str, typer.Option(help="Training views, as for run.")] = "all",
-    trajectory: Annotated[
-        str, typer.Option(help="auto, single_spiral, single_orbit, realestate10k, llff, dtu, co3d or mipnerf360.")
-    ] = "auto",
+    trajectory: Annotated[str, typer.Option(help="auto, or a recipe such as single_orbit or co3d.")] = "auto",
     count: Annotated[int | None, typer.Option(help="Views to generate; without it the recipe's own number.")] = None,
     downscale: DownscaleOption = 1,
     seed: SeedOption = 0,

@@ -99,27 +99,14 @@ def settings(prompt: Prompt) -> dict[str, Any]:
 
 def _made(prompt: Prompt) -> np.ndarray:
     """(H, W, 3) uint8."""
-    try:
-        import transformers  # noqa: F401
-        from diffusers import DiffusionPipeline
-    except ImportError as error:
-        raise InputError(
-            f"Text needs two more packages ({error}): install them with `pip install cat3d[text]`."
-        ) from None
-    where = device()
-    try:
-        pipeline = DiffusionPipeline.from_pretrained(
-            str(prompt.pipeline), local_files_only=True, use_safetensors=True,
-            torch_dtype=torch.float16 if where == "cuda" else torch.float32,
-        )  # fmt: skip
-    except (OSError, ValueError, ImportError) as error:
-        raise InputError(f"--text-to-image {prompt.pipeline} can't be loaded: {' '.join(str(error).split())}") from None
+    pipeline, where = _loaded(prompt.pipeline), device()
+    pipeline.to(where, torch.float16 if where == "cuda" else torch.float32)
     pipeline.set_progress_bar_config(disable=True)
     asked: dict[str, Any] = {"num_inference_steps": prompt.steps, "guidance_scale": prompt.guidance}
     asked |= {"height": prompt.side, "width": prompt.side}
     random = torch.Generator().manual_seed(derive_seed(prompt.seed, prompt.text, "text to photo"))
     with console.status(f"Making a photo of “{prompt.text}”"), torch.no_grad():
-        result = pipeline.to(where)(
+        result = pipeline(
             prompt=prompt.text, generator=random, **{name: value for name, value in asked.items() if value is not None}
         )
     image = np.asarray(result.images[0].convert("RGB"))
@@ -131,6 +118,27 @@ def _made(prompt: Prompt) -> np.ndarray:
             f"“{prompt.text}”: ask for something else, or with another seed."
         )
     return image
+
+
+def _loaded(folder: Path) -> Any:
+    """The pipeline in a folder, on the CPU: safetensors alone, nothing downloaded, no code of the folder's own."""
+    try:
+        import transformers
+        from diffusers import DiffusionPipeline
+        from diffusers.utils import logging
+    except ImportError as error:
+        raise InputError(
+            f"Text needs two more packages ({error}): install them with `pip install cat3d[text]`."
+        ) from None
+    logging.set_verbosity_error()
+    logging.disable_progress_bar()
+    transformers.utils.logging.disable_progress_bar()
+    try:
+        return DiffusionPipeline.from_pretrained(
+            str(folder), local_files_only=True, use_safetensors=True, low_cpu_mem_usage=False
+        )
+    except (OSError, ValueError, ImportError) as error:
+        raise InputError(f"--text-to-image {folder} can't be loaded: {' '.join(str(error).split())}") from None
 
 
 def _name(text: str, wanted: dict[str, Any]) -> str:

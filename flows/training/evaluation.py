@@ -30,12 +30,12 @@ from cat3d_core.metrics.psnr import psnr
 from cat3d_core.metrics.ssim import ssim
 from cat3d_core.normalization import normalize_scene
 from cat3d_core.random import normal
-from cat3d_core.rays import image_rays
 from cat3d_core.sample_sets import sample_cameras, source_boxes
 from cat3d_core.synthetic import FAMILIES
 from cat3d_core.synthetic.held_out import held_out_group
 from cat3d_core.synthetic.tracer import Traced
 from cat3d_core.view_selection import camera_distance
+from cat3d_core.warp import warp
 from flows.errors import InputError
 from flows.generation.formats import cat3d
 from flows.jobs.device import exact_device
@@ -47,28 +47,6 @@ CAPTURED = ("llff_fern", "dtu_scan24", "co3d_apple", "re10k_bedroom", "mipnerf36
 ALL_CAPTURED = "all captured"
 WORLDS = "held-out worlds"
 METHODS = ("sample", "nearest", "warp", "autoencoder")
-
-
-def warp(traced: Traced, cameras: Cameras, target: int, sources: list[int]) -> tuple[Tensor, Tensor]:
-    """Carry `sources` (best first) into `target` by its true depth: image (3, H, W), seen (H, W) bool."""
-    height, width = traced.depth.shape[-2:]
-    depth = traced.depth[target].reshape(-1, 1).double()
-    # The sky is far away, not nowhere.
-    depth = torch.where(depth.isfinite(), depth, torch.full_like(depth, 1e4))
-    rays = image_rays(cameras, target)
-    image, seen = torch.zeros(3, height * width), torch.zeros(height * width, dtype=torch.bool)
-    pixels, z = cameras.project(rays.origins + depth * rays.directions)
-    for source in sources:
-        grid = (pixels[source] / torch.tensor([width, height]) * 2 - 1).float()[None, :, None]
-        there = torch.nan_to_num(traced.depth[source], posinf=1e4)[None, None]
-        reached = F.grid_sample(there, grid, mode="nearest", align_corners=False)[0, 0, :, 0]
-        visible = (
-            (grid[0, :, 0].abs() <= 1).all(-1) & (z[source] > 0) & ((reached - z[source]).abs() < 0.03 * z[source])
-        )
-        colour = F.grid_sample(traced.image[source][None], grid, align_corners=False, padding_mode="border")[0, :, :, 0]
-        new = visible & ~seen
-        image[:, new], seen = colour[:, new], seen | visible
-    return image.reshape(3, height, width), seen.reshape(height, width)
 
 
 def captured_group(scene: Path, size: int, given: int, views: int = 8) -> tuple[Tensor, Cameras]:
@@ -117,7 +95,9 @@ def warped(traced: Traced, cameras: Cameras, given: int) -> Tensor:
     order = camera_distance(cameras)[given:, :given].argsort(1)
     images = []
     for row, target in enumerate(range(given, len(cameras))):
-        image, seen = warp(traced, cameras, target, order[row].tolist())
+        near = order[row].tolist()
+        photos, depths = traced.image[near], traced.depth[near]
+        image, seen = warp(list(photos), list(depths), cameras[near], cameras[target], traced.depth[target])
         images.append(torch.where(seen, image, traced.image[order[row, 0]]))
     return torch.stack(images)
 

@@ -92,7 +92,7 @@ def test_killed_and_resumed_by_two_workers_it_gives_equal_bits(
         start_new_session=True,
     )  # fmt: skip
     deadline = time.monotonic() + 900
-    while not any(tmp_path.glob("*.zarr/runs/v3-cat3d/generated/latent/c*/*")):
+    while not any(tmp_path.glob("*.zarr/runs/v3-cat3d/generated/done_latent/c.*")):
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.02)
