@@ -89,16 +89,19 @@ def stored_renders(section: Section) -> tuple[list[Render], Cameras]:
         step = max(1, -(-int(cameras.size[i].max()) // SIDE))
         arrays = [section.read_image(name, i)[::step, ::step] for name in ("image", "depth", "opacity")]
         image, depth, opacity = (torch.from_numpy(np.ascontiguousarray(array)).float() for array in arrays)
-        height, width = depth.shape
-        # Every step-th pixel: the centre of the first one is half a pixel in, as before.
-        k = cameras.intrinsics[i].clone()
-        k[:2] /= step
-        k[:2, 2] += 0.5 - 0.5 / step
-        camera = Cameras(k[None], cameras.world_from_camera[i : i + 1], torch.tensor([[width, height]]))
+        camera = thinned(cameras[i], step)
         normals = normals_from_depth(depth, image_rays(camera, 0))
         renders.append(Render(image / 255, depth, depth, opacity, normals))
         resized.append(camera)
     return renders, Cameras.cat(resized)
+
+
+def thinned(camera: Cameras, step: int) -> Cameras:
+    """The camera of every step-th pixel of an image, from the first one on: what a kept pixel sees stays."""
+    k = camera.intrinsics.clone()
+    k[:, :2] /= step
+    k[:, :2, 2] += 0.5 - 0.5 / step  # the centre of the first pixel is half a pixel in, before and after
+    return Cameras(k, camera.world_from_camera, -(-camera.size // step))
 
 
 def camera_rows(views: list[ShownView]) -> list[dict[str, Any]]:
