@@ -4,8 +4,8 @@
     python -m infra.export_sweep WORK --fit WORK --data "procedural scenes"
 
 `--fit` names folders of scenes (renders/*.safetensors); the first shard of each was held out of the training, and the
-composite is fitted on it (flows/bench/sweep_composite.py). Without it the last file's composite stays. Evaluate with
-`python -m flows.bench.sweep FILE`.
+composite is fitted on it (flows/training/sweep_composite.py). Without it the last file's composite stays. Evaluate with
+`python -m flows.training.sweep_evaluation FILE`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 from cat3d_core.matching.checkpoint import describe_sweep, load_sweep, save_sweep
-from flows.bench.sweep_composite import fitted, validation_cases
+from flows.training.sweep_composite import fitted, validation_cases
 from infra.export_default import ROOT, without_folders
 
 WEIGHTS = ROOT / "cat3d_core" / "weights" / "sweep.safetensors"

@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 STDLIB = sys.stdlib_module_names
 ALLOWED = {
-    "cat3d_core": {"torch", "numpy", "safetensors", "triton", "cat3d_core"},  # triton: guarded, GPU kernels only
+    "cat3d_core": {"torch", "numpy", "safetensors", "triton", "gsplat", "cat3d_core"},  # triton, gsplat: guarded
     "schemas": {"zarr", "numcodecs", "pyarrow", "pydantic", "yaml", "numpy", "schemas"},
 }
 PACKAGES = (*ALLOWED, "flows")
@@ -24,7 +24,7 @@ PENDING = {
 LONGEST_FILE = 300
 #: Modules from a command down to the core, both counted, at most. At commit 0888913 it was 44: modules on a circle all
 #: need each other, and with the stages that were imported by name one circle was 14 modules long.
-LONGEST_CHAIN = 21
+LONGEST_CHAIN = 23
 
 
 def module_name(path: Path) -> str:

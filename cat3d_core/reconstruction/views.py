@@ -241,7 +241,7 @@ class Batch:
         return dataclasses.replace(self, **parts)
 
 
-def _draw_views(views: Views, count: int, captured_share: float, generator: torch.Generator) -> Tensor:
+def draw_views(views: Views, count: int, captured_share: float, generator: torch.Generator) -> Tensor:
     """`count` views, each as often as it has pixels that count, of all of its own; but captured views together have at
     least the probability `captured_share`."""
     whole = views.counting / views.size.prod(-1)
@@ -267,7 +267,7 @@ def draw_batch(views: Views, patches: int, patch: int, captured_share: float, ge
         raise ValueError(
             f"Patches of {patch} pixels do not fit a view whose shorter side is {smallest}; lower patch_size."
         )
-    view = _draw_views(views, patches, captured_share, generator)
+    view = draw_views(views, patches, captured_share, generator)
     if patch == 1 and views.valid is not None and views.counting.any():
         number = torch.rand(patches, generator=generator, device=view.device, dtype=torch.float64)
         xy = views.pixel(view, (number * views.counting[view]).long())

@@ -14,12 +14,15 @@ from cat3d_core.stress import (
     networks,
     poses,
     rendering,
+    splats,
     training,
 )  # fmt: skip
 from cat3d_core.stress.routine import Exact, Routine
 from cat3d_core.stress.search import Finding, stress
 
-_SUBJECTS = (geometry, poses, coordinates, intervals, rendering, training, diffusion, networks, metrics, matching)
+_SUBJECTS = (
+    geometry, poses, coordinates, intervals, rendering, training, diffusion, networks, metrics, matching, splats,
+)  # fmt: skip
 ROUTINES = [routine for subject in _SUBJECTS for routine in subject.ROUTINES]
 
 __all__ = ["ROUTINES", "Exact", "Finding", "Routine", "stress"]

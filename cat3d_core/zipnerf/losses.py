@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import torch
 from torch import Tensor
 
@@ -12,6 +14,17 @@ from cat3d_core.zipnerf.render import Round
 
 #: z-depth in scene units below which the inverse depth rises no further, so that its gradient stays bounded.
 NEAREST = 0.01
+
+
+class Trust(Protocol):
+    """Settings of `view_weights`, whatever is reconstructed (see ZipNerfConfig)."""
+
+    @property
+    def distance_falloff(self) -> float: ...
+    @property
+    def distance_unit(self) -> float: ...
+    @property
+    def generated_weight_final(self) -> float: ...
 
 
 def charbonnier(difference: Tensor, eps: float) -> Tensor:
@@ -58,7 +71,7 @@ def annealed(weight: float, until: float, progress: float) -> float:
     return weight * max(0.0, 1.0 - progress / until) if until > 0 else 0.0
 
 
-def view_weights(centers: Tensor, captured: Tensor, config: ZipNerfConfig, progress: float) -> Tensor:
+def view_weights(centers: Tensor, captured: Tensor, config: Trust, progress: float) -> Tensor:
     """Loss weight (N,) of each view at `progress` in [0, 1] through training (CAT3D app., 'Distance based weighting').
 
     Captured views weigh 1; a generated view exp(-b s^2) * g with s the distance of its centre (N, 3, normalised units)

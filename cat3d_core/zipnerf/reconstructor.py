@@ -10,11 +10,12 @@ from torch import Tensor
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.decision import Decision
-from cat3d_core.metrics.perceptual import PerceptualDistance, find_perceptual, perceptual_name
+from cat3d_core.metrics.perceptual import perceptual_name
+from cat3d_core.reconstruction.perceptual import perceptual_loss
 from cat3d_core.reconstruction.protocol import ReconstructionRequest, Reconstructor
 from cat3d_core.reconstruction.render import Render
 from cat3d_core.reconstruction.views import Views
-from cat3d_core.zipnerf.config import PRESETS, ZipNerfConfig
+from cat3d_core.zipnerf.config import PRESETS
 from cat3d_core.zipnerf.field import Field
 from cat3d_core.zipnerf.render import render_image, render_uncertainty
 from cat3d_core.zipnerf.settings import chosen_config, config_document, config_from_document, fitted, rules
@@ -45,6 +46,12 @@ class ZipNerf:
         field = Field.from_state(config_from_document(settings["trainer"]), tensors)
         return cls(settings, field=field.to(device).eval())
 
+    @classmethod
+    def from_state(cls, settings: Mapping[str, Any], state: Mapping[str, Tensor], device: str) -> Self:
+        """As `from_tensors`, from the `state` of a training under way."""
+        own = {name.removeprefix("field."): v for name, v in state.items() if name.startswith("field.")}
+        return cls.from_tensors(settings, own, device)
+
     @property
     def trainer(self) -> Trainer:
         """The training under way. Raises ValueError before `start`."""
@@ -62,7 +69,7 @@ class ZipNerf:
             raise ValueError("A finished field is not trained further; make a new one from a request.")
         config = config_from_document(self.settings["trainer"])
         config, decisions = fitted(config, views, self._request.skip, self._request.overrides)
-        perceptual, warnings = _perceptual(config)
+        perceptual, warnings = perceptual_loss(config.lpips_weight, config.patch_size)
         self._trainer = Trainer(config, views, seed, device, perceptual)
         return decisions + warnings
 
@@ -101,21 +108,6 @@ class ZipNerf:
 
 
 _: type[Reconstructor] = ZipNerf  # for the type checker: it keeps the protocol
-
-
-def _perceptual(config: ZipNerfConfig) -> tuple[PerceptualDistance | None, list[Decision]]:
-    """The perceptual network of the LPIPS loss, where one is wanted and can be used, or why it is not."""
-    if config.lpips_weight == 0:
-        return None, []
-    found = find_perceptual()
-    if found is None:
-        text = "No perceptual network was found on this machine: trained without the LPIPS loss."
-        return None, [Decision("warning", text)]
-    smallest = found.architecture.smallest
-    if config.patch_size < smallest:
-        text = f"Trained without the LPIPS loss: {found.name} needs patches of {smallest} pixels, and these are "
-        return None, [Decision("warning", f"{text}{config.patch_size}.")]
-    return found, []
 
 
 def _left_out(first: int, end: int, every: int) -> int:

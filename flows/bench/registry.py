@@ -19,7 +19,7 @@ from cat3d_core.generation.advice import MEASURED
 from cat3d_core.metrics.perceptual import find_perceptual
 from cat3d_core.weights import default_model_path
 from cat3d_core.zipnerf import PRESETS
-from flows.bench import metrics, plan, poses, reconstruct, sampler, scenes, skips, store, synthetic
+from flows.bench import cameras, metrics, plan, poses, reconstruct, sampler, scenes, skips, splats, store, synthetic
 from flows.errors import InputError
 from flows.generation.formats import cat3d
 from flows.media.images import read_image
@@ -152,6 +152,15 @@ def pose_rows(quick: bool, data: Path | None) -> list[Row]:
     return _marked(rows, {"features": default})
 
 
+def camera_rows(quick: bool, data: Path | None) -> list[Row]:
+    """The scenes of `data` that have cameras, else procedural ones."""
+    sources: list[str | Path] = list(cameras.PROCEDURAL)
+    if data is not None:
+        known = [*poses.SCENES, "dtu_scan37", "re10k_bedroom", "mipnerf360_bonsai", "nerf_synthetic_lego"]
+        sources = list(_scenes(data, known[:1] if quick else known))
+    return cameras.rows(sources[:1] if quick else sources, trials=15 if quick else 105)
+
+
 def metric_rows(quick: bool, data: Path | None) -> list[Row]:
     rows = metrics.rows(2, 252, 336, 3) if quick else metrics.rows()
     return _marked(rows, {"implementation": "cat3d"})
@@ -205,6 +214,15 @@ def synthetic_rows(quick: bool, data: Path | None) -> list[Row]:
     return synthetic.rows(64, 8, 1) if quick else synthetic.rows()
 
 
+def splat_rows(quick: bool, data: Path | None) -> list[Row]:
+    """The rasteriser's speed, splats of fields, and both reconstructors on few views."""
+    if quick:
+        families = ("co3d",)
+        rows = splats.kernel_rows(1, (1,)) + splats.conversion_rows(families, size=32, steps=60)
+        return rows + splats.method_rows(families, (3,), (0,), (("splats", "tiny"),), size=32)
+    return splats.kernel_rows() + splats.conversion_rows() + splats.method_rows()
+
+
 _SAMPLER_POINT = {"series": ("solver", "nodes"), "label": ("steps", "dtype"), "each": ("interval",)}
 BENCHES: dict[str, Bench] = {
     "sampler": Bench(
@@ -237,6 +255,9 @@ BENCHES: dict[str, Bench] = {
         pose_rows,
         (Panel("Poses", "seconds", "rotation_deg_median", ("features",), each=("scene",)),),
     ),
+    "cameras": Bench(
+        "wrong given cameras: false alarms and seconds of the check, and which random damage it catches", camera_rows
+    ),
     "metrics": Bench(
         "PSNR, SSIM and the perceptual distance beside other packages: seconds and rounding error",
         metric_rows,
@@ -258,6 +279,12 @@ BENCHES: dict[str, Bench] = {
         "time and quality of whole runs with nothing skipped, each skip alone, the defaults, and everything skipped",
         skip_rows,
         (Panel("Skips", "cpu_seconds", "psnr_db", ("variant",), each=("set",), where=(("scene", "mean"),),
+               higher_is_better=True),),
+    ),
+    "splats": Bench(
+        "the rasteriser beside plain torch, splats of a field beside the field, splats beside zipnerf on few views",
+        splat_rows,
+        (Panel("Reconstructors", "cpu_s", "psnr", ("method",), ("preset", "seed"), ("family", "views"),
                higher_is_better=True),),
     ),
     "synthetic": Bench("procedural scenes rendered: views a second per family", synthetic_rows),

@@ -1,4 +1,4 @@
-"""`cat3d export`: a finished run as a mesh, a point cloud, a data set for other trainers, renders along a path."""
+"""`cat3d export`: a finished run as a mesh, points, splats, a data set for other trainers, renders along a path."""
 
 from __future__ import annotations
 
@@ -9,17 +9,21 @@ import torch
 
 from cat3d_core.random import generator
 from cat3d_core.reconstruction import PointCloud, point_cloud, surface_depth
+from cat3d_core.splats import REFINE
+from cat3d_core.splats.viewpoints import between
 from flows.errors import InputError
 from flows.exports.dataset import write_dataset
 from flows.exports.mesh import fuse, without_crumbs, write_mesh_glb, write_mesh_ply
 from flows.exports.path import read_path, write_renders
+from flows.exports.plan import open_plan, write_plan_folder
 from flows.exports.ply import write_ply
 from flows.exports.source import Source, open_source, render_views, surface_cameras, training_images
+from flows.exports.splats import MOST, splats_of, write_splats
 from flows.media.images import to_uint8
 from flows.open3d_import import import_open3d
 from flows.progress import console
 
-KINDS = ("mesh", "points", "dataset", "renders")
+KINDS = ("mesh", "points", "splats", "dataset", "renders", "plan")
 #: Points from which splats start: nerfstudio's and INRIA's trainers split and prune from there.
 DATASET_POINTS = 50_000
 
@@ -28,17 +32,23 @@ DATASET_POINTS = 50_000
 class SurfaceSettings:
     """resolution: voxels along the mesh's cube of side 2 radius; radius: what counts as the scene, in units of the mean
     distance from the cameras to what they look at; opacity: least opacity of a surface pixel; views: cameras to render
-    at most; scale: their size relative to the photos."""
+    at most; scale: their size relative to the photos; splats: so many at most; refine: steps in which splats learn to
+    look like the renders."""
 
     resolution: int = 512
     radius: float = 3.0
     opacity: float = 0.5
     views: int = 120
     scale: float = 1.0
+    splats: int = MOST
+    refine: int = REFINE.iterations
 
     def __post_init__(self) -> None:
-        for name, low, high in (("resolution", 8, 8192), ("radius", 0.01, 1e4), ("opacity", 0.0, 1.0),
-                                ("views", 1, 100_000), ("scale", 0.01, 16.0)):  # fmt: skip
+        limits: dict[str, tuple[float, float]] = {
+            "resolution": (8, 8192), "radius": (0.01, 1e4), "opacity": (0.0, 1.0), "views": (1, 100_000),
+            "scale": (0.01, 16.0), "splats": (1, 10_000_000), "refine": (0, 100_000),
+        }  # fmt: skip
+        for name, (low, high) in limits.items():
             value = getattr(self, name)
             if not low <= value <= high:
                 raise InputError(f"--{name} is {value:g}; it must lie between {low:g} and {high:g}.")
@@ -53,7 +63,7 @@ def export_command(
     settings: SurfaceSettings | None = None,
     path_file: Path | None = None,
 ) -> list[Path]:
-    """Write what is asked for (comma-separated KINDS; all but renders if empty) to `out`; the files and folders made.
+    """Write what is asked for (comma-separated KINDS; mesh, points and dataset if empty) to `out`; what was made.
 
     Raises InputError for everything a user can correct.
     """
@@ -61,12 +71,16 @@ def export_command(
     kinds = _kinds(what, path_file)
     if "mesh" in kinds:
         import_open3d("Meshes")  # before minutes of rendering
+    if "plan" in kinds:
+        _export_plan(path, run_name, frame, out)
+    if kinds == {"plan"}:
+        return [out / "plan"]
     source = open_source(path, run_name, frame)
     first = source.store.captured.read("size")[0].tolist()
     camera_path = read_path(path_file, *first) if path_file is not None else None
     out.mkdir(parents=True, exist_ok=True)
     made: list[Path] = []
-    if kinds & {"mesh", "points", "dataset"}:
+    if kinds & {"mesh", "points", "splats", "dataset"}:
         made += _surface_exports(source, kinds, out, settings)
     if camera_path is not None and "renders" in kinds:
         count = write_renders(source, camera_path, out / "renders")
@@ -75,6 +89,14 @@ def export_command(
     for file in made:
         console.print(f"  {file}")
     return made
+
+
+def _export_plan(path: Path, run_name: str | None, frame: str, out: Path) -> None:
+    plan = open_plan(path, run_name, frame)
+    count = write_plan_folder(plan, out / "plan", path)
+    hints = "with hints from a reconstruction" if plan.scene else "without hints: no run reconstructed these photos yet"
+    console.print(f"plan: {count} planned views, {hints}")
+    console.print(f"  {out / 'plan'}")
 
 
 def _kinds(what: str, path_file: Path | None) -> set[str]:
@@ -86,11 +108,13 @@ def _kinds(what: str, path_file: Path | None) -> set[str]:
         raise InputError("Renders need a camera path: give its file as --path FILE.json.")
     if path_file is not None:
         return kinds | {"renders"}
-    return kinds or {"mesh", "points", "dataset"}
+    return kinds or {"mesh", "points", "splats", "dataset"}
 
 
 def _surface_exports(source: Source, kinds: set[str], out: Path, settings: SurfaceSettings) -> list[Path]:
     cameras = surface_cameras(source, settings.views)
+    if kinds == {"splats"}:
+        cameras = between(cameras, settings.views)
     renders = list(render_views(source, cameras, settings.scale))
     shown = {"min_opacity": settings.opacity, "max_depth": float("inf"), "max_radius": settings.radius}
     made = []
@@ -102,6 +126,11 @@ def _surface_exports(source: Source, kinds: set[str], out: Path, settings: Surfa
         write_mesh_glb(out / "mesh.glb", mesh)
         console.print(f"mesh: {len(mesh.vertices)} vertices, {len(mesh.faces)} faces from {len(cameras)} views")
         made += [out / "mesh.ply", out / "mesh.glb"]
+    if "splats" in kinds:
+        splats = splats_of(source.scene, renders, cameras, settings.splats, settings.refine)
+        files, told = write_splats(out, splats, source.frame_from_scene)
+        console.print(f"splats: {len(splats)} from {len(cameras)} views", *told)
+        made += files
     if kinds & {"points", "dataset"}:
         cloud = _mapped(point_cloud(renders, cameras, **shown), source)
         if not len(cloud.points):

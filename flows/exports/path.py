@@ -16,7 +16,7 @@ from flows.exports.source import Source, render_views
 from flows.media.images import read_image, write_png
 from flows.media.pictures import depth_picture
 from flows.media.video import write_video
-from flows.readers.parsing import load_json, numbers
+from flows.readers.parsing import from_opengl, load_json, numbers
 
 LARGEST_SIDE = 8192
 
@@ -31,12 +31,19 @@ class CameraPath:
 
 def read_path(path: Path, width: int, height: int) -> CameraPath:
     """Read a camera path: a list of {"world_from_camera": 4x4 (OpenCV axes), "fov": vertical, degrees}, or an object
-    with that list as "frames" and optionally "width", "height" (pixels; default: as given) and "fps".
+    with that list as "frames" and optionally "width", "height" (pixels; default: as given) and "fps"; or nerfstudio's
+    camera_path.json, whose poses are taken to be in the same frame.
 
     Raises InputError naming the frame that cannot be used.
     """
-    document = load_json(path)
+    return parse_path(load_json(path), path, width, height)
+
+
+def parse_path(document: Any, path: Path | str, width: int, height: int) -> CameraPath:
+    """`read_path` of what its file holds; `path` names it in errors."""
     header: dict[str, Any] = document if isinstance(document, dict) else {"frames": document}
+    if "camera_path" in header:
+        header = _from_nerfstudio(header, path)
     frames = header.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(f'{path} holds no list of frames; write [{{"world_from_camera": 4x4, "fov": degrees}}, ...].')
@@ -63,6 +70,22 @@ def read_path(path: Path, width: int, height: int) -> CameraPath:
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
     return CameraPath(cameras, float(fps))
+
+
+def _from_nerfstudio(document: dict[str, Any], path: Path | str) -> dict[str, Any]:
+    """nerfstudio's camera_path.json as our document. Raises InputError for what is not a perspective path."""
+    kind, cameras = document.get("camera_type", "perspective"), document["camera_path"]
+    if kind != "perspective":
+        raise InputError(f"{path} is a path of {kind} cameras; only perspective ones can be rendered.")
+    if not isinstance(cameras, list) or not all(isinstance(camera, dict) for camera in cameras):
+        raise InputError(f'{path}: "camera_path" is not a list of cameras.')
+    frames = []
+    for i, camera in enumerate(cameras):
+        pose = numbers(camera.get("camera_to_world"), (16,), f"camera_to_world of camera {i}", path)
+        frames.append({"world_from_camera": from_opengl(pose.view(1, 4, 4))[0].tolist(), "fov": camera.get("fov")})
+    found = {"frames": frames, "fps": document.get("fps", 30)}
+    sizes = {"width": document.get("render_width"), "height": document.get("render_height")}
+    return found | {name: size for name, size in sizes.items() if size is not None}
 
 
 def write_renders(source: Source, path: CameraPath, folder: Path) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import torch
 from safetensors import safe_open
@@ -10,7 +11,7 @@ from safetensors.torch import save_file
 
 from cat3d_core.reconstruction import Reconstructor
 from flows.errors import InputError
-from flows.jobs.device import device
+from flows.jobs.device import exact_device
 from flows.jobs.job import Job
 from flows.reconstruction.open import reconstructor_class
 from schemas.errors import ConfigError
@@ -50,7 +51,7 @@ def read_reconstruction(store: SceneStore, run: Run) -> Reconstructor:
     method, settings = attrs.get("method", "zipnerf"), attrs.get("settings", record.inputs)
     tensors = {name: torch.from_numpy(section.read(name)) for name in attrs["parameters"]}
     try:
-        return reconstructor_class(method).from_tensors(settings, tensors, device())
+        return reconstructor_class(method).from_tensors(settings, tensors, exact_device())
     except ConfigError as error:
         raise InputError(f"The field of {run.name} in {store.folder} cannot be read: {error}") from None
     except (KeyError, TypeError, ValueError) as error:
@@ -60,11 +61,16 @@ def read_reconstruction(store: SceneStore, run: Run) -> Reconstructor:
         ) from None
 
 
+def checkpoint_path(out: Path, scene_id: str, run: str) -> Path:
+    """Where the state of a run's reconstruction is while it is under way."""
+    return out / ".work" / f"{scene_id}-{run}.safetensors"
+
+
 class Checkpoint:
     """The state of a reconstruction on disk while the stage runs, beside the store, replaced atomically."""
 
     def __init__(self, job: Job, key: str) -> None:
-        self.path = job.out / ".work" / f"{job.scene_id}-{job.run}.safetensors"
+        self.path = checkpoint_path(job.out, job.scene_id, job.run)
         self.key = key  # only a step with the same inputs and settings may go on from it
 
     def save(self, state: dict[str, torch.Tensor]) -> None:

@@ -36,6 +36,7 @@ from flows.reporting.summary import (
     timing_rows,
     title,
 )
+from flows.reporting.turning import PAGE_BYTES, turning_scene
 from flows.stages import STAGES
 from schemas.scene_store import Run, SceneStore
 from schemas.tables import TIMINGS, read_rows
@@ -53,6 +54,7 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
     if only_if_changed and page.exists():
         return page
     scenes = [scene_section(out, path) for path in sorted(out.glob("*.zarr"))]
+    embed_scenes(out, scenes)
     rows, timings = summary_rows(out), timing_rows(out)
     tables = paper_tables(rows)
     sweep = _document(out / SWEEP) or {}
@@ -99,7 +101,7 @@ def gallery(scenes: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]) ->
         name = best.get(scene["id"])
         shown = {run["name"] for run in scene["runs"] if run["views"]}
         if name is not None and name in shown:
-            rival = beside.get((scene["id"], name))
+            rival: str | None = beside.get((str(scene["id"]), str(name)))
             out.append({"scene": scene["id"], "run": name, "rival": rival if rival in shown else None})
     return out
 
@@ -126,6 +128,7 @@ def scene_section(out: Path, path: Path) -> dict[str, Any]:
                 "decisions": {stage: record.decisions for stage, record in records.items() if record.decisions},
                 "codes": {stage: record.code_version for stage, record in records.items()},
                 "model": records["sample"].inputs.get("model", "") if "sample" in records else "",
+                "terms": run.generated.attrs.get("terms", "") if "generated" in run else "",
                 "config": run.attrs.get("job", {}).get("config", {}),
                 "plan": _uri((folder / "plan.png").read_bytes()) if (folder / "plan.png").exists() else None,
                 "video": f"{store.scene_id}/{name}/path.mp4" if (folder / "path.mp4").exists() else None,
@@ -133,6 +136,20 @@ def scene_section(out: Path, path: Path) -> dict[str, Any]:
             }
         )
     return {"id": store.scene_id, "dataset": store.dataset, "runs": runs, "provenance": store.attrs["provenance"]}
+
+
+def embed_scenes(out: Path, scenes: Sequence[dict[str, Any]]) -> None:
+    """Add to the first run of each scene what one needs to turn it in the page, as far as there is room; then to the
+    further runs."""
+    room = PAGE_BYTES
+    for rank in range(max((len(scene["runs"]) for scene in scenes), default=0)):
+        for scene in scenes:
+            if rank < len(scene["runs"]):
+                run = scene["runs"][rank]
+                store = SceneStore.open(out / f"{scene['id']}.zarr")
+                found = turning_scene(store, store.run(run["name"]), room)
+                run["turning"] = found
+                room -= found.get("bytes", 0) if found else 0
 
 
 def _run_order(name: str) -> tuple:

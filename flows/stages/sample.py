@@ -14,11 +14,13 @@ from cat3d_core.plan import Group
 from flows.errors import WorkerError
 from flows.generation.groups import StoredPlan, view_keys
 from flows.generation.hints import explained_views
+from flows.generation.imported import samples
 from flows.generation.open import generator_spec, open_generator
+from flows.generation.opening import opening
 from flows.generation.rounds import OneRound, Rounds
 from flows.generation.sampling import sampler_config, sampler_settings
 from flows.jobs.job import Job, Outcome
-from flows.jobs.stage import Stage, generates, settings_of
+from flows.jobs.stage import Stage, settings_of
 from flows.workers.fan_out import Totals, fan_out
 from flows.workers.work import Work, is_done
 from schemas.decisions import Decision, chosen, skipped
@@ -39,7 +41,9 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
 
     Views that the scene doesn't need are recorded there as left out on purpose.
     """
+    opening(job)  # before workers are started in vain
     run = store.run(job.run)
+    run.generated.set_attrs(terms=generator_spec(job).terms)
     plan = StoredPlan(store, run, job.config.seed)
     explained = explained_views(run)
     rounds = Rounds(job, store, plan, sampling_flops(job, plan)) if job.config.skip.rounds else OneRound(plan)
@@ -167,5 +171,5 @@ STAGE = Stage(
     reads=("plan", "match", "encode"),
     settings=settings_of("sample", "seed", without=("generator", "checkpoint")),  # its identity is among the inputs
     inputs=inputs,
-    wanted=generates,
+    wanted=samples,
 )

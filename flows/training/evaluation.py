@@ -38,7 +38,7 @@ from cat3d_core.synthetic.tracer import Traced
 from cat3d_core.view_selection import camera_distance
 from flows.errors import InputError
 from flows.generation.formats import cat3d
-from flows.jobs.device import device
+from flows.jobs.device import exact_device
 from flows.media.images import read_image, square_image, write_png
 from flows.readers.base import read_capture
 from flows.training.worlds.held_out import HeldOutWorld, held_out_worlds
@@ -221,7 +221,7 @@ def evaluate_file(
 ) -> str:
     """Markdown tables of PSNR, SSIM and (where weights are found) perceptual distance of a model file."""
     perceptual = find_perceptual()
-    generator = cat3d.load(path, device(), "bfloat16")
+    generator = cat3d.load(path, exact_device(), "bfloat16")
     result = rows(
         generator, scenes, sampler=sampler, perceptual=perceptual, pictures=pictures,
         captured=captured_scenes(data), worlds=worlds,

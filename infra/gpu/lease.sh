@@ -54,7 +54,7 @@ train() {
   if [ "$name" = sweep ]; then
     "$PYTHON" -m infra.export_sweep "$WORK/sweep_leg_$leg" --to "$out/sweep.safetensors"
     if [ "${SCENES:-1}" -gt 0 ]; then
-      "$PYTHON" -m flows.bench.sweep "$out/sweep.safetensors" --scenes "${SCENES:-1}" --cache "$WORK/sweep_bench" --json "$out/sweep.json"
+      "$PYTHON" -m flows.training.sweep_evaluation "$out/sweep.safetensors" --scenes "${SCENES:-1}" --cache "$WORK/sweep_bench" --json "$out/sweep.json"
     fi
     tar czf "$out/training.tar.gz" -C "$WORK/sweep_leg_$leg" training validation training.json
   else

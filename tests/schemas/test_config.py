@@ -76,7 +76,7 @@ def test_several_errors_are_all_named() -> None:
 def test_the_json_schema_describes_every_field() -> None:
     schema = json_schema()
     models = [schema, *schema["$defs"].values()]
-    assert len(models) == 10
+    assert len(models) == 11
     for model in models:
         assert model["additionalProperties"] is False
         for name, field in model["properties"].items():
@@ -88,7 +88,7 @@ def test_a_short_name_of_earlier_versions_stands_for_what_is_generated() -> None
     assert parse_config({"method": "cat3d"}, "test").generate == "always"
     assert parse_config({"method": "zipnerf"}, "test").generate == "never"
     assert merged({"generate": "never"}, {"method": "cat3d"})["generate"] == "always", "later settings win"
-    with pytest.raises(ConfigError, match="run.yaml: method cat3d stands for generate always, but that is never"):
+    with pytest.raises(ConfigError, match="run.yaml: method cat3d stands for generate always, but generate is never"):
         parse_config({"method": "cat3d", "generate": "never"}, "run.yaml")
     with pytest.raises(ConfigError, match="run.yaml: method is 'nerf'; it may be auto, zipnerf, cat3d"):
         parse_config({"method": "nerf"}, "run.yaml")

@@ -19,6 +19,7 @@ from cat3d_core import alignment, cameras, splines
 from cat3d_core.diffusion import guidance, schedule, solvers
 from cat3d_core.metrics import psnr, ssim
 from cat3d_core.reconstruction import render as image_render
+from cat3d_core.splats import density, reference
 from cat3d_core.stress import ROUTINES, stress
 from cat3d_core.zipnerf import adam, coordinates, frustums, gradients, grid_reference, losses, render, stepfun
 from flows.commands.stress import QUICK_CASES, stress_command
@@ -152,6 +153,16 @@ MUTATIONS: dict[str, tuple[Callable[..., Any], dict[str, str], str]] = {
         solvers.Solver._first_order,
         {"return gain * x +": "x = x.half().to(x.dtype); return gain * x +"},
         "solvers.ddim",
+    ),
+    "determinant of an image by a difference": (
+        reference.project,
+        {"torch.linalg.cross(factor[:, 0], factor[:, 1]).square().sum(-1)": "xx * yy - xy * xy"},
+        "splats.project",
+    ),
+    "root of a small opacity's rest": (
+        density.split,
+        {"torch.log1p(-opacity)": "(1 - opacity).log()"},
+        "splats.split",
     ),
     "guidance at scale 1": (guidance.GuidanceConfig.active, {"self.scale != 1.0 and": ""}, "guidance.guided"),
 }

@@ -22,6 +22,7 @@ from cat3d_core.metrics.geometry import nearest_distances
 from cat3d_core.normalization import Similarity
 from cat3d_core.rays import image_rays
 from cat3d_core.reconstruction import Render, normals_from_depth, point_cloud, surface_depth
+from cat3d_core.splats import render
 from cat3d_core.synthetic.capture import look_at
 from cat3d_core.zipnerf import PRESETS, Field, render_ladder
 from flows.bench.geometry import mesh_row, sample_surface, true_depths
@@ -34,6 +35,8 @@ from flows.exports.dataset import write_dataset
 from flows.exports.path import read_path
 from flows.exports.ply import write_ply
 from flows.exports.source import open_source, training_images
+from flows.exports.splat_files import READERS
+from flows.jobs.access import read_cameras
 from flows.jobs.request import make_config
 from flows.media.images import read_image
 from flows.open3d_import import import_open3d
@@ -322,6 +325,21 @@ def test_both_frames_are_one_similarity_apart(stored: Path, tmp_path: Path) -> N
     np.testing.assert_allclose(clouds["world"], expected, atol=1e-5)
 
 
+def test_splats_of_a_run_look_like_its_field_in_the_worlds_frame(stored: Path, tmp_path: Path) -> None:
+    settings = SurfaceSettings(splats=3000, refine=200)
+    files = export_command(stored, None, "splats", tmp_path, "world", settings)
+    assert [file.name for file in files] == ["splats.ply", "splats.splat", "splats.spz"]
+    source = open_source(stored, None, "world")
+    cameras = read_cameras(source.store.captured).to(dtype=torch.float32)
+    wanted = source.scene.render(cameras, 1).image
+    there = source.frame_from_scene.cameras(cameras)
+    for file in files:
+        splats = READERS[file.suffix](file)
+        assert len(splats) <= 3000
+        error = (render(splats, there, 1).image - wanted).square().mean()
+        assert -10 * math.log10(float(error)) > 22, file.name
+
+
 def test_views_of_the_run_are_exported_as_stored(stored: Path) -> None:
     views = training_images(open_source(stored, None, "world"))
     truth = read_capture("procedural:co3d/1?views=10&width=32&height=24")
@@ -333,7 +351,7 @@ def test_views_of_the_run_are_exported_as_stored(stored: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "fault"),
     [
-        ({"what": "splats"}, '"splats" cannot be exported; choose among mesh'),
+        ({"what": "surfels"}, '"surfels" cannot be exported; choose among mesh'),
         ({"what": "renders"}, "--path FILE.json"),
         ({"frame": "camera"}, "no frame"),
         ({"run_name": "v3-cat3d"}, "has no run"),

@@ -20,8 +20,8 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.matching.checkpoint import load_sweep
 from cat3d_core.matching.composite import Composite
 from cat3d_core.matching.network import SweepNetwork
-from flows.bench.sweep import VIEWS, Case, case, sampled, swept
 from flows.training.renders import save, shards
+from flows.training.sweep_evaluation import VIEWS, Case, case, sampled, swept
 
 MIDDLES = torch.linspace(0.05, 0.75, 15).tolist()
 SOFTNESSES = (0.05, 0.1, 0.15, 0.2, 0.3)
