@@ -106,9 +106,9 @@ def test_photos_are_read_and_hashed_once_however_many_jobs_ask(monkeypatch: pyte
     read, hashed = scene.read_capture, scene.capture_digests
 
     def counted(name, function):
-        def call(*arguments):
+        def call(*arguments, **named):
             counts[name] += 1
-            return function(*arguments)
+            return function(*arguments, **named)
 
         return call
 
