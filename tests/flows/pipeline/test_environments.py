@@ -23,10 +23,12 @@ def test_this_machine_is_reached_without_the_proxy(monkeypatch, tmp_path: Path) 
 
 def test_a_run_behind_a_proxy_without_a_home_and_with_prefect_settings_of_another_server(tmp_path: Path) -> None:
     """The proxy answers nothing, the base path would move our server's address, and there is no home at all."""
+    (tmp_path / "file").write_text("no folder, so that no home can be made below it")
     environment = {
         "PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1",
         "HTTP_PROXY": "http://127.0.0.1:9", "http_proxy": "http://127.0.0.1:9", "ALL_PROXY": "http://127.0.0.1:9",
-        "PREFECT_SERVER_API_BASE_PATH": "/elsewhere", "PREFECT_PROFILE": "nobody", "HOME": "/nonexistent/home",
+        "PREFECT_SERVER_API_BASE_PATH": "/elsewhere", "PREFECT_PROFILE": "nobody",
+        "HOME": str(tmp_path / "file" / "home"),
     }  # fmt: skip
     command = [
         sys.executable, "-m", "flows.cli", "run", SCENE, "--out", str(tmp_path / "out"), "--views", "3",
