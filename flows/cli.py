@@ -10,7 +10,6 @@ from typing import Annotated, Any
 
 import typer
 
-import flows.cli_develop  # noqa: F401  (registers its commands)
 from flows.cli_app import (
     ConfigOption,
     DownscaleOption,
@@ -219,6 +218,9 @@ def results(
     from flows.commands.results import results_command
 
     raise typer.Exit(1 if results_command(out, against, bound, bound_rest) else 0)
+
+
+import flows.cli_develop  # noqa: E402, F401  (registers its commands, after those above)
 
 
 def main() -> None:
