@@ -26,13 +26,32 @@ def _processor() -> str:
         return platform.processor()
 
 
+def cache_folder() -> Path:
+    """Where compiled kernels are kept: $CAT3D_CACHE, the home's .cache/cat3d, or where there is no home that can be
+    written (containers) a folder of this user's in the temporary directory. Raises OSError where none can be had."""
+    if given := os.environ.get("CAT3D_CACHE"):
+        return Path(given)
+    try:
+        folder = Path.home() / ".cache" / "cat3d"
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return folder
+    except (RuntimeError, OSError):
+        pass
+    folder = Path(tempfile.gettempdir()) / f"cat3d-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    if folder.stat().st_uid != os.getuid():  # somebody else's: no code is loaded from there
+        raise OSError(f"{folder} belongs to another user; name a folder in CAT3D_CACHE")
+    return folder
+
+
 def _compile(name: str) -> Path:
     """Path of the shared library of this package's NAME.cpp (such as zipnerf/hash_grid) for this processor, compiled
     where the cache lacks it."""
     source = Path(__file__).parent / f"{name}.cpp"
     compiler = os.environ.get("CXX", "g++")
     key = hashlib.sha256(source.read_bytes() + repr((compiler, _FLAGS, _processor())).encode()).hexdigest()[:24]
-    folder = Path(os.environ.get("CAT3D_CACHE") or Path.home() / ".cache" / "cat3d")
+    folder = cache_folder()
     library = folder / f"{source.stem}-{key}.so"
     if not library.exists():
         folder.mkdir(parents=True, exist_ok=True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from cat3d_core.coverage import Coverage, coverage, direction_bins, gains, seen_
 from cat3d_core.sample_sets import KINDS, kept_window, sample_cameras
 from cat3d_core.trajectories import RECIPES, FreeSpace, SceneFrame, build_trajectory, choose_recipe, scene_frame
 from cat3d_core.view_selection import NO_VIEW, consecutive_groups, farthest_points, nearest_views
+from cat3d_core.windows import lay_out, runs
 
 SQUARE, WIDE = range(2)
 #: A captured view this close in direction shows a place as a generated one would.
@@ -35,7 +37,8 @@ class PlanConfig:
     of a sample in pixels. pitch_down_deg: how far a single captured camera looks down (several show it themselves).
     drop_by_coverage: leave out views that add nothing to the coverage. covered_share: plan that nothing be generated
     where captured views see this share of what the path's views see from nearly the same directions (at most
-    COVERED_DEG beside them); None: generate in any case.
+    COVERED_DEG beside them); None: generate in any case. layout: "groups", as above, or "windows" (`windows.lay_out`),
+    which needs neither anchors, conditions nor group_size.
     """
 
     trajectory: str = "auto"
@@ -55,6 +58,7 @@ class PlanConfig:
     pitch_down_deg: float = 0.0
     drop_by_coverage: bool = False
     covered_share: float | None = None
+    layout: Literal["groups", "windows"] = "groups"
 
     def __post_init__(self) -> None:
         if self.trajectory != "auto" and self.trajectory not in RECIPES:
@@ -90,8 +94,8 @@ class Plan:
     the sample to keep. groups: each view is a target of one. recipe: name. reasons: why, in sentences. frame: the scene
     as the plan saw it (None where an older program stored the plan). captured_count: V. captured_coverage,
     plan_coverage: before and after (captured and planned views together). needed: False where captured views cover the
-    path already (`PlanConfig.covered_share`): sample nothing.
-    """
+    path already (`PlanConfig.covered_share`): sample nothing. dropped: views of the path that add nothing to the
+    coverage and are not among the N."""
 
     cameras: Cameras
     path: Tensor
@@ -104,17 +108,16 @@ class Plan:
     captured_coverage: Coverage
     plan_coverage: Coverage
     needed: bool = True
+    dropped: int = 0
 
     def __len__(self) -> int:
         return len(self.cameras)
 
     def passes(self) -> list[list[int]]:
-        """Numbers of the groups that can be sampled at the same time, in order: those of anchors, then the others; none
-        where nothing need be generated."""
-        if not self.needed:
-            return []
-        first = [g for g, group in enumerate(self.groups) if group.anchors]
-        return [p for p in (first, [g for g, group in enumerate(self.groups) if not group.anchors]) if p]
+        """Numbers of the groups that can be sampled at the same time: those of anchors, then the others, if needed."""
+        numbers = range(len(self.groups)) if self.needed else ()
+        parts = ([g for g in numbers if self.groups[g].anchors == first] for first in (True, False))
+        return list(filter(None, parts))
 
     def among(self, views: Sequence[int], count: int) -> Plan:
         """The same plan where its captured view i is number views[i] of `count` captured views."""
@@ -210,18 +213,19 @@ def make_plan(
             reasons.append(f"The path is not covered by captured views: {seen} ({config.covered_share:.0%} would do).")
         else:
             reasons.append(f"The path is covered, so its {len(poses)} views need not be generated: {seen}.")
+    dropped = 0
     if config.drop_by_coverage and needed:
         useful = gains(after, before) > 0
         if useful.any() and not useful.all():
-            reasons.append(
-                f"{int((~useful).sum())} of {len(useful)} views add nothing to the coverage and were dropped."
-            )
+            dropped = int((~useful).sum())
+            reasons.append(f"{dropped} of {len(useful)} views add nothing to the coverage and were dropped.")
             poses, path, after = poses[useful], path[useful], after[useful]
 
     samples = [_with_poses(captured, poses, kind, config.image_size) for kind in kinds]
     groups: list[Group] = []
     for number, (kind, cameras) in enumerate(zip(kinds, samples, strict=True)):
-        groups += _groups(captured, cameras, path, kind, config, frame, first=number * len(poses))
+        grouped = _groups if config.layout == "groups" else _windows
+        groups += grouped(captured, cameras, path, kind, config, frame, first=number * len(poses))
     size = captured.size.median(0).values[None]
     windows = [kept_window(size, kind, config.image_size).expand(len(poses), 4) for kind in kinds]
     return Plan(
@@ -236,6 +240,7 @@ def make_plan(
         captured_coverage=coverage(before),
         plan_coverage=coverage(torch.cat([before, after])),
         needed=needed,
+        dropped=dropped,
     )
 
 
@@ -259,7 +264,7 @@ def _groups(
     anchor_size = config.views - 1 if single and config.group_size is None else size
     others = sorted(set(range(len(cameras))) - set(anchors))
     members = [(g, True) for g in consecutive_groups(anchors, anchor_size)]
-    for begin, end in _runs(path[others].tolist()):
+    for begin, end in runs(path[others].tolist()):
         members += [(g, False) for g in consecutive_groups(others[begin:end], size)]
 
     sources = Cameras.cat([captured, cameras[anchors]])
@@ -280,7 +285,16 @@ def _groups(
     return groups
 
 
-def _runs(path: list[int]) -> list[tuple[int, int]]:
-    """Half-open ranges of equal path numbers: a group never spans two paths."""
-    edges = [0] + [i for i in range(1, len(path)) if path[i] != path[i - 1]] + [len(path)]
-    return [(a, b) for a, b in zip(edges, edges[1:], strict=False) if b > a]
+def _windows(
+    captured: Cameras, cameras: Cameras, path: Tensor, kind: str, config: PlanConfig, frame: SceneFrame, first: int
+) -> list[Group]:
+    """The same in windows of both passes, the nearest captured views in each."""
+    layout = lay_out(path.tolist(), len(captured), config.views)
+    passes = ((layout.first, len(captured), bool(layout.second)), (layout.second, layout.given, False))
+    groups, count = [], len(captured) + first
+    for windows, slots, of_anchors in passes:
+        for anchors, targets in windows:
+            known = sorted(nearest_views(cameras[targets], captured, slots, frame.distance))
+            conditions = (*known, *(count + anchor for anchor in anchors))
+            groups.append(Group(tuple(first + view for view in targets), conditions, kind, of_anchors))
+    return groups

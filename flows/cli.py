@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from pathlib import Path
@@ -9,46 +10,49 @@ from typing import Annotated, Any
 
 import typer
 
-app = typer.Typer(
-    help="3D scenes from a handful of photos: an open, batch implementation of the CAT3D paper.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
+import flows.cli_develop  # noqa: F401  (registers its commands)
+from flows.cli_app import (
+    ConfigOption,
+    DownscaleOption,
+    ImagesOption,
+    OutOption,
+    ReaderOption,
+    SeedOption,
+    SetOption,
+    app,
 )
-
-OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for stores, tables, pictures and the report.")]
 
 
 @app.command()
 def run(
-    source: Annotated[
-        str, typer.Argument(help="A scene's folder (any supported layout, or just photos), or procedural:FAMILY/SEED.")
-    ],
+    source: Annotated[str, typer.Argument(help="A scene's folder, or just photos, or procedural:FAMILY/SEED.")] = "",
     out: OutOption = Path("outputs"),
-    views: Annotated[
-        str, typer.Option(help="Training views: counts with a split of the data set, or all; several by commas.")
-    ] = "all",
-    downscale: Annotated[float, typer.Option(help="Divide image width and height by this.")] = 1,
-    method: Annotated[
-        str, typer.Option(help="zipnerf: captured views only; cat3d: with generated views; auto: cat3d for one photo.")
-    ] = "auto",
+    prompt: Annotated[str, typer.Option(help="Text instead of a folder: what the scene's one photo shows.")] = "",
+    text_to_image: Annotated[Path | None, typer.Option(help="Folder of a diffusers pipeline for --prompt.")] = None,
+    text_settings: Annotated[str, typer.Option(help="Its settings, e.g. {steps: 20, guidance: 5, side: 512}.")] = "",
+    views: Annotated[str, typer.Option(help="Training views: counts of a split, or all; several by commas.")] = "all",
+    downscale: DownscaleOption = 1,
+    method: Annotated[str, typer.Option(help="zipnerf: photos; cat3d: and generated views; auto: by number.")] = "auto",
     preset: Annotated[str, typer.Option(help="reconstruction preset: tiny, fast, balanced, paper.")] = "fast",
-    seed: Annotated[int, typer.Option(help="All randomness follows from it.")] = 0,
-    model: Annotated[Path | None, typer.Option(help="Diffusion model file instead of the shipped one.")] = None,
-    reader: Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")] = "auto",
-    images: Annotated[str | None, typer.Option(help="Image folder inside the scene, where there are several.")] = None,
-    config: Annotated[Path | None, typer.Option(help="Settings from a YAML or JSON file; options here win.")] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="One setting, e.g. --set render.path_views=30. May be repeated.")
-    ] = None,
+    seed: SeedOption = 0,
+    model: Annotated[Path | None, typer.Option(help="A generator's file or folder, not the shipped model.")] = None,
+    reader: ReaderOption = "auto",
+    images: ImagesOption = None,
+    config: ConfigOption = None,
+    set_: SetOption = None,
 ) -> None:
     """Photos in, 3D scene out: renders, metrics and a report. Stages that are done already are not done again."""
+    if bool(prompt) == bool(source) or bool(prompt) != (text_to_image is not None):
+        raise typer.BadParameter("Give the scene's folder, or --prompt and --text-to-image.")
     from flows.commands.run import run_command
     from flows.jobs.request import make_request
 
-    given = {"downscale": downscale, "method": method, "preset": preset, "seed": seed}
-    if model is not None:
-        given["model"] = str(model.resolve())
+    given: dict[str, Any] = {"downscale": downscale, "method": method, "preset": preset, "seed": seed}
+    given |= {"model": str(model.resolve())} if model else {}
+    if text_to_image is not None:
+        from flows.generation.text import make_prompt, text_to_photo
+
+        source = str(text_to_photo(make_prompt(prompt, text_to_image, seed, text_settings), out.resolve()))
     run_command(make_request(source, out, views, given, reader, images, config, set_ or []))
 
 
@@ -68,23 +72,24 @@ def plan(
     source: Annotated[str, typer.Argument(help="A scene's folder, or procedural:FAMILY/SEED.")],
     out: OutOption = Path("outputs"),
     views: Annotated[str, typer.Option(help="Training views, as for run.")] = "all",
-    trajectory: Annotated[
-        str, typer.Option(help="auto, single_spiral, single_orbit, realestate10k, llff, dtu, co3d or mipnerf360.")
-    ] = "auto",
+    trajectory: Annotated[str, typer.Option(help="auto, or a recipe such as single_orbit or co3d.")] = "auto",
     count: Annotated[int | None, typer.Option(help="Views to generate; without it the recipe's own number.")] = None,
-    downscale: Annotated[float, typer.Option(help="Divide image width and height by this.")] = 1,
-    seed: Annotated[int, typer.Option(help="All randomness follows from it.")] = 0,
-    reader: Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")] = "auto",
-    images: Annotated[str | None, typer.Option(help="Image folder inside the scene, where there are several.")] = None,
-    config: Annotated[Path | None, typer.Option(help="Settings from a YAML or JSON file; options here win.")] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", help="One setting, as for run. May be repeated.")] = None,
+    downscale: DownscaleOption = 1,
+    seed: SeedOption = 0,
+    model: Annotated[Path | None, typer.Option(help="Plan for this model's file or folder.")] = None,
+    reader: ReaderOption = "auto",
+    images: ImagesOption = None,
+    config: ConfigOption = None,
+    set_: SetOption = None,
     rows: Annotated[int, typer.Option(help="Groups to print at most.")] = 24,
 ) -> None:
     """Which views would be generated, how they are grouped and on what they are conditioned: a table and a picture."""
     from flows.commands.plan import plan_command
     from flows.jobs.request import make_request
 
-    given = {"method": "cat3d", "downscale": downscale, "seed": seed, "trajectory": trajectory, "count": count}
+    given: dict[str, Any] = {"method": "cat3d", "downscale": downscale, "seed": seed}
+    given |= {"trajectory": trajectory, "count": count}
+    given |= {"model": str(model.resolve())} if model else {}
     plan_command(make_request(source, out, views, given, reader, images, config, set_ or []), rows)
 
 
@@ -106,7 +111,9 @@ def inspect(
 def export(
     store: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder) with a finished run.")],
     run_name: Annotated[str | None, typer.Option("--run", help="The run, where the store has several.")] = None,
-    what: Annotated[str, typer.Option(help="mesh, points, splats, dataset, renders; default: all but renders.")] = "",
+    what: Annotated[
+        str, typer.Option(help="mesh, points, splats, dataset (these if not given), renders, plan; by commas.")
+    ] = "",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the exports.")] = Path("exports"),
     frame: Annotated[str, typer.Option(help="world: the data set's own; scene: normalised, +z up.")] = "world",
     resolution: Annotated[int, typer.Option(help="Voxels along each side of the mesh's cube.")] = 512,
@@ -125,6 +132,23 @@ def export(
     export_command(store, run_name, what, out, frame, settings, path)
 
 
+@app.command(name="import-views")
+def import_views(
+    store: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder) with a plan.")],
+    folder: Annotated[Path | None, typer.Argument(help="Folder with view_0000.png and so on.")] = None,
+    run_name: Annotated[str | None, typer.Option("--run", help="The run, where several have a plan.")] = None,
+    note: Annotated[str, typer.Option(help="What made the pictures, such as a model's name; it is recorded.")] = "",
+    partial: Annotated[bool, typer.Option("--partial", help="Some planned views may be missing.")] = False,
+    forget: Annotated[bool, typer.Option("--forget", help="Generate the views here again instead.")] = False,
+) -> None:
+    """Pictures of a plan's views that any other program made (see export --what plan) become the run's."""
+    from flows.commands.import_views import import_views_command
+
+    if forget == (folder is not None):
+        raise typer.BadParameter("Give a folder of pictures, or --forget.")
+    import_views_command(store, folder, run_name, note, partial)
+
+
 @app.command()
 def view(
     path: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder), or the folder of a run or sweep.")],
@@ -139,7 +163,7 @@ def view(
 
 @app.command()
 def models(
-    describe: Annotated[str | None, typer.Option(help="Describe a size: tiny, small, paper.")] = None,
+    describe: Annotated[str | None, typer.Option(help="Describe a size: tiny, small, paper, seva.")] = None,
     model: Annotated[Path | None, typer.Option(help="Also show this model file.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
 ) -> None:
@@ -197,80 +221,6 @@ def results(
     raise typer.Exit(1 if results_command(out, against, bound, bound_rest) else 0)
 
 
-@app.command()
-def train(
-    config: Annotated[
-        str, typer.Argument(help="A training's YAML file, or the name of a shipped preset (see --list).")
-    ] = "",
-    out: OutOption = Path("outputs/training"),
-    list_: Annotated[bool, typer.Option("--list", help="List the shipped presets.")] = False,
-    steps: Annotated[int | None, typer.Option(help="Optimizer steps, instead of the configuration's.")] = None,
-    minutes: Annotated[float | None, typer.Option(help="Or the time spent in training.")] = None,
-    autoencoder: Annotated[Path | None, typer.Option(help="Take the autoencoder of this file.")] = None,
-    start: Annotated[Path | None, typer.Option(help="Weights to start from.")] = None,
-    seed: Annotated[int | None, typer.Option(help="All randomness follows from it.")] = None,
-    device: Annotated[str | None, typer.Option(help="auto, cpu or cuda.")] = None,
-    bank_only: Annotated[bool, typer.Option("--bank-only", help="Only make what is trained on.")] = False,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="One setting, e.g. --set optimizer.groups=8. May be repeated.")
-    ] = None,
-) -> None:
-    """Train a multi-view diffusion model on procedural scenes; run again, it goes on where it was stopped."""
-    from flows.commands.train import train_command
-
-    path = str(autoencoder) if autoencoder else None
-    given: dict[str, Any] = {"steps": steps, "minutes": minutes, "seed": seed, "device": device}
-    given |= {"start": str(start) if start else None} | ({"autoencoder": {"path": path}} if path else {})
-    train_command(config, out, given, set_ or [], list_, bank_only)
-
-
-@app.command()
-def worlds(
-    package: Annotated[Path, typer.Argument(help="Folder for Debian's supertuxkart-data; fetched if not there yet.")],
-    held_out: Annotated[
-        Path | None, typer.Option(help="Photograph the held-out tracks into this folder, to evaluate models on.")
-    ] = None,
-    groups: Annotated[int, typer.Option(help="How many held-out groups of cameras, at least.")] = 60,
-    views: Annotated[int, typer.Option(help="Cameras of a held-out group.")] = 10,
-    size: Annotated[int, typer.Option(help="Side of their pictures in pixels.")] = 128,
-) -> None:
-    """Fetch textured worlds to train on (628 MB, nothing is installed), and list their licences."""
-    from flows.commands.worlds import worlds_command
-
-    worlds_command(package, held_out, groups, views, size)
-
-
-@app.command()
-def stress(
-    quick: Annotated[bool, typer.Option("--quick", help="Under a minute: a few thousand cases a routine.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
-    only: Annotated[str, typer.Option(help="Only routines with this in their name, e.g. ssim or solvers.unipc.")] = "",
-    seed: Annotated[int, typer.Option(help="Another seed searches elsewhere.")] = 0,
-) -> None:
-    """Search the worst relative error of every numerical routine; exit code 1 when a bound is broken."""
-    from flows.commands.stress import stress_command
-
-    stress_command(quick, as_json, only, seed)
-
-
-@app.command()
-def bench(
-    name: Annotated[str, typer.Argument(help="A benchmark, or all; without it they are listed.")] = "",
-    quick: Annotated[bool, typer.Option("--quick", help="Small sizes: all of them in minutes on two cores.")] = False,
-    data: Annotated[Path | None, typer.Option(help="Folder of real scenes, for what needs them.")] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", "-o", help="Folder for benchmarks.md and benchmarks/NAME.parquet; docs/reference in a checkout."
-        ),
-    ] = None,
-) -> None:
-    """Run time against error for every stage: tables, fronts, and where the defaults stand on them."""
-    from flows.commands.bench import bench_command
-
-    raise typer.Exit(1 if bench_command(name, quick, data, out) else 0)
-
-
 def main() -> None:
     """Entry point: errors a user can act on end in one sentence and exit code 1, without a traceback."""
     # Before torch and Prefect are imported: no busy-waiting threads on shared machines, no log lines between ours.
@@ -279,6 +229,9 @@ def main() -> None:
     os.environ.setdefault("PREFECT_LOGGING_INTERNAL_LEVEL", "CRITICAL")
     from flows.errors import describe
 
+    for stream in (sys.stdout, sys.stderr):  # a terminal or pipe that lacks a letter shows ? for it
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         app()
     except (

@@ -26,4 +26,10 @@ def describe(error: BaseException) -> str | None:
     if isinstance(error, OSError) and error.errno is not None:
         where = f" ({error.filename})" if error.filename else ""
         return f"The system refused: {error.strerror}{where}. Free space or permissions may be missing."
+    if type(error).__name__ in ("PrefectHTTPStatusError", "PrefectHTTPServerError"):  # Prefect is not imported for this
+        return (
+            f"This command's Prefect server failed ({str(error).splitlines()[0]}). Most often the disk under --out is "
+            "full or cannot be written; OUT/.prefect/server.log says more. Free space and run again: "
+            "what is stored is kept."
+        )
     return None

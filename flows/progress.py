@@ -36,7 +36,8 @@ class Meter:
             self._spoke = time.monotonic()
             elapsed = self._spoke - self._started
             left = elapsed / max(done, 1) * (self.total - done)
-            console.print(f"  {self.label}: {done}/{self.total}, about {left:.0f} s left {note}")
+            text = f"  {self.label}: {done}/{self.total}, about {left:.0f} s left {note}"
+            console.print(text, markup=False)
 
 
 @contextlib.contextmanager
@@ -46,8 +47,8 @@ def meter(label: str, total: int) -> Iterator[Meter]:
         yield Meter(label, total, None)
         return
     columns = (
-        TextColumn("  {task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        TimeRemainingColumn(), TextColumn("{task.fields[note]}"),
+        TextColumn("  {task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        TimeRemainingColumn(), TextColumn("{task.fields[note]}", markup=False),
     )  # fmt: skip
     with Progress(*columns, console=console, transient=True) as progress:
         yield Meter(label, total, progress)

@@ -59,6 +59,8 @@ def without_folders(value: Any) -> Any:
     """A document in which absolute paths, which say nothing elsewhere, are replaced by their last name."""
     if isinstance(value, dict):
         return {name: without_folders(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [without_folders(part) for part in value]
     return Path(value).name if isinstance(value, str) and value.startswith("/") else value
 
 

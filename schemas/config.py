@@ -37,6 +37,10 @@ class IngestConfig(_Model):
     """Divide width and height by this."""
     max_pixels: PositiveInt = 100_000_000
     """Refuse larger source images, in pixels."""
+    frames: Annotated[int, Field(ge=2)] = 60
+    """Frames taken of a video: the sharpest of each of as many equal stretches."""
+    check_cameras: bool = True
+    """Compare given cameras with matches between the photos, and warn of views that they do not fit."""
 
 
 class PosesConfig(_Model):
@@ -77,6 +81,8 @@ class PlanConfig(_Model):
     """Anchor views sampled first; None: 7 with a single photo, else none."""
     always_captured: bool = False
     """Captured views take conditioning slots before anchors do."""
+    image_size: PositiveInt | None = None
+    """Side of the planned views in pixels; None: the generator's. Another is for views that another program makes."""
     wide: bool = False
     """Add the wide samples from padded squares for photos that aren't square."""
 
@@ -104,8 +110,8 @@ class SampleConfig(_Model):
     guidance_log_snr: tuple[FiniteFloat | None, FiniteFloat | None] | None = None
     """Lowest and highest log-SNR at which guidance is on, where `skip.guidance` is; a bound of None: no bound.
     None: up to 2, the interval on the measured front."""
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Of the network; the sampler's state is float32 always. bfloat16 is for GPUs."""
+    precision: Literal["float32", "bfloat16", "float16"] = "float32"
+    """Of the network; the sampler's state is float32 always. bfloat16 and float16 are for GPUs."""
 
 
 class ExecutionConfig(_Model):

@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Mapping
 from enum import Enum
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,12 @@ def array_digest(array: NDArray[Any]) -> str:
     digest = hashlib.sha256(f"{little.dtype.str}{array.shape}".encode())
     digest.update(little.tobytes())
     return digest.hexdigest()
+
+
+def file_sha256(path: Path) -> str:
+    """sha256 of a file's bytes, hexadecimal."""
+    with open(path, "rb") as f:
+        return hashlib.file_digest(f, "sha256").hexdigest()
 
 
 def _tagged(value: Any, where: str) -> list[Any]:

@@ -9,34 +9,26 @@ import yaml
 
 from schemas.errors import ConfigError
 
-#: What the short names `method: NAME` and `--method NAME` stand for.
-METHODS: dict[str, dict[str, Any]] = {
-    "auto": {"generate": "auto"},
-    "zipnerf": {"generate": "never", "reconstruct": {"method": "zipnerf"}},
-    "cat3d": {"generate": "always", "reconstruct": {"method": "zipnerf"}},
-}
+#: What the short names `method: NAME` and `--method NAME` say about `generate`.
+METHODS = {"auto": "auto", "zipnerf": "never", "cat3d": "always"}
 
 
 def spelled_out(document: dict[str, Any]) -> dict[str, Any]:
-    """Settings with the short name `method`, as files and stores of earlier versions have it, replaced by what it
-    stands for. Raises ConfigError for an unknown name, and for one that contradicts `generate` or `reconstruct`."""
+    """Settings with the short name `method`, as files and stores of earlier versions have it, replaced by `generate`.
+
+    Raises ConfigError for an unknown name, and for one that contradicts `generate`.
+    """
     if "method" not in document:
         return document
     rest = {name: value for name, value in document.items() if name != "method"}
-    name = document["method"]
+    name, own = document["method"], document.get("generate")
     if name not in METHODS:
         raise ConfigError(f"method is {name!r}; it may be {', '.join(METHODS)}.")
-    for where in ("generate", "reconstruct.method"):
-        own, short = (_at(d, where.split(".")) for d in (rest, METHODS[name]))
-        if own is not None and short not in (None, own):
-            raise ConfigError(f"method {name} stands for {where} {short}, but {where} is {own}: give one of the two.")
-    return _merged(METHODS[name], rest)
-
-
-def _at(document: Any, path: Sequence[str]) -> Any:
-    for part in path:
-        document = document.get(part) if isinstance(document, dict) else None
-    return document
+    if own not in (None, METHODS[name]):
+        raise ConfigError(
+            f"method {name} stands for generate {METHODS[name]}, but generate is {own}: give one of them."
+        )
+    return rest | {"generate": METHODS[name]}
 
 
 def merged(*documents: dict[str, Any]) -> dict[str, Any]:

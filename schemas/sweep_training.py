@@ -19,12 +19,17 @@ class Kind(BaseModel):
 
 
 class GeometryBankConfig(_Model):
-    """Scenes with exact depth: procedural ones, rendered once, and folders of others (`cat3d worlds`)."""
+    """Scenes with exact depth: procedural ones and worlds, rendered once, and folders of others."""
 
     families: Annotated[tuple[Family, ...], Field(min_length=1)] = ("llff", "dtu", "co3d", "re10k", "mip360")
     """Families of procedural scenes, in turn."""
     scenes: PositiveInt = 2000
     """Procedural scenes."""
+    worlds: Path | None = None
+    """Folder into which Debian's supertuxkart-data was unpacked (`cat3d worlds`); as often drawn as all procedural
+    scenes together."""
+    world_groups: PositiveInt = 600
+    """Captures of these worlds, if there are any."""
     views: Annotated[int, Field(ge=2)] = 10
     """Cameras of a scene; photos and targets are drawn from them."""
     size: Annotated[int, Field(ge=16, multiple_of=16)] = 128

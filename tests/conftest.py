@@ -43,3 +43,9 @@ def shared_data() -> Path:
 def shared_weights() -> Path:
     """Folder of foreign weights (LPIPS backbone, tiny autoencoder); skips where absent."""
     return _shared("weights")
+
+
+@pytest.fixture(scope="session")
+def shared_fixtures() -> Path:
+    """Folder of numbers that other people's code gave; skips where absent (they are not ours to redistribute)."""
+    return _shared("fixtures")

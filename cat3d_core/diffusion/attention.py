@@ -21,7 +21,7 @@ def fold_views(tokens: Tensor, views: int, mode: ViewAttention) -> Tensor:
     "3d": [G, V*L, C], space and views together; "temporal": [G*L, V, C], the views at one place; "none": unchanged.
     Groups never share a sequence.
     """
-    if mode == "none" or views == 1:
+    if mode == "none":
         return tokens
     images, length, channels = tokens.shape
     if mode == "3d":
@@ -32,7 +32,7 @@ def fold_views(tokens: Tensor, views: int, mode: ViewAttention) -> Tensor:
 
 def unfold_views(tokens: Tensor, views: int, length: int, mode: ViewAttention) -> Tensor:
     """The inverse of `fold_views`: back to [G*V, length, C]."""
-    if mode == "none" or views == 1:
+    if mode == "none":
         return tokens
     channels = tokens.shape[-1]
     if mode == "3d":
@@ -105,6 +105,9 @@ class Attention(nn.Module):
     def forward(self, tokens: Tensor, context: Tensor | None = None, frames: ViewFrames | None = None) -> Tensor:
         """tokens [B, L, C], context [B, K, C'] (None: self-attention) -> [B, L, C]. With `frames` (self-attention
         over V views of a group) it depends on relative cameras."""
+        if context is not None and context.shape[1] == 1:  # the softmax over one key is 1, whatever the query
+            constant: Tensor = self.to_out[0](self.to_v(context))
+            return constant.expand(-1, tokens.shape[1], -1)
         context = tokens if context is None else context
         q, k, v = (
             t.unflatten(-1, (self.heads, -1)) for t in (self.to_q(tokens), self.to_k(context), self.to_v(context))
@@ -206,12 +209,17 @@ class SpatialTransformer(nn.Module):
         frames = None if frames is None else frames.at(height, width)
         h = self.norm(x)
         tokens = self.proj_in(_to_tokens(h)) if self.linear_projection else _to_tokens(self.proj_in(h))
-        for block in self.transformer_blocks:
-            tokens = block(tokens, views, context, frames)
+        tokens = self.mix(tokens, views, context, frames)
         if self.linear_projection:
             return x + _to_map(self.proj_out(tokens), height, width)
         out: Tensor = x + self.proj_out(_to_map(tokens, height, width))
         return out
+
+    def mix(self, tokens: Tensor, views: int, context: Tensor | None, frames: ViewFrames | None) -> Tensor:
+        """The blocks on tokens [G*V, h*w, C] -> the same shape."""
+        for block in self.transformer_blocks:
+            tokens = block(tokens, views, context, frames)
+        return tokens
 
 
 def _to_tokens(x: Tensor) -> Tensor:

@@ -30,22 +30,36 @@ class TimeMLP(nn.Module):
 
 
 class ResnetBlock(nn.Module):
-    """Two convolutions with group norm and SiLU, a residual, and an optional bias from the time embedding."""
+    """Two convolutions with group norm and SiLU, a residual, and an optional bias from the time embedding.
+
+    map_channels: what the first convolution sees is scaled and shifted, place by place, by a map of so many channels.
+    """
 
     def __init__(
-        self, channels_in: int, channels_out: int, time_channels: int | None, norm_groups: int = 32, eps: float = 1e-5
+        self,
+        channels_in: int,
+        channels_out: int,
+        time_channels: int | None,
+        norm_groups: int = 32,
+        eps: float = 1e-5,
+        map_channels: int | None = None,
     ) -> None:
         super().__init__()
         self.norm1 = nn.GroupNorm(norm_groups, channels_in, eps=eps)
+        self.map_proj = nn.Conv2d(map_channels, 2 * channels_in, 1) if map_channels else None
         self.conv1 = nn.Conv2d(channels_in, channels_out, 3, padding=1)
         self.time_emb_proj = nn.Linear(time_channels, channels_out) if time_channels else None
         self.norm2 = nn.GroupNorm(norm_groups, channels_out, eps=eps)
         self.conv2 = nn.Conv2d(channels_out, channels_out, 3, padding=1)
         self.conv_shortcut = nn.Conv2d(channels_in, channels_out, 1) if channels_in != channels_out else None
 
-    def forward(self, x: Tensor, time: Tensor | None = None) -> Tensor:
-        """x [B, C, h, w]; time [B, time_channels] after its SiLU."""
-        h = self.conv1(F.silu(self.norm1(x)))
+    def forward(self, x: Tensor, time: Tensor | None = None, maps: Tensor | None = None) -> Tensor:
+        """x [B, C, h, w]; time [B, time_channels] after its SiLU; maps [B, map_channels, h, w]."""
+        h = F.silu(self.norm1(x))
+        if self.map_proj is not None:
+            scale, shift = self.map_proj(maps).chunk(2, 1)
+            h = h * (1 + scale) + shift
+        h = self.conv1(h)
         if self.time_emb_proj is not None:
             h = h + self.time_emb_proj(time)[:, :, None, None]
         h = self.conv2(F.silu(self.norm2(h)))

@@ -15,7 +15,9 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from cat3d_core.diffusion.config import UNetConfig
+from cat3d_core.diffusion.ldm_names import from_ldm
 from cat3d_core.diffusion.unet import MultiViewUNet
+from cat3d_core.seva.checkpoint import NO_START, is_seva
 
 _TEXT = re.compile(r"(.*\.transformer_blocks\.\d+)\.(attn2|norm2)\.")
 
@@ -118,8 +120,14 @@ def _read(path: Path) -> tuple[dict[str, Tensor], Any]:
     prefix = "model.diffusion_model."
     if any(k.startswith(prefix) for k in weights):
         weights = {k[len(prefix) :]: v for k, v in weights.items() if k.startswith(prefix)}
+    if is_seva({name: tuple(t.shape) for name, t in weights.items()}):
+        raise ValueError(NO_START.format(path=file))
     if "input_blocks.0.0.weight" in weights:
-        weights = _from_ldm(weights, file)
+        try:
+            ours = from_ldm(weights)
+        except ValueError as error:
+            raise ValueError(f"{file} holds no Stable Diffusion U-Net: {error}.") from None
+        weights = {ours[name]: value for name, value in weights.items()}
     heads = None
     if (folder / "config.json").is_file():
         description = json.loads((folder / "config.json").read_text())
@@ -152,51 +160,3 @@ def _infer_config(weights: dict[str, Tensor], heads: Any, path: str | Path) -> U
         linear_projection=linear,
         cross_attention_dim=weights["mid_block.attentions.0.transformer_blocks.0.attn2.to_k.weight"].shape[1],
     )
-
-
-_LDM_RESNET = {
-    "in_layers.0": "norm1",
-    "in_layers.2": "conv1",
-    "emb_layers.1": "time_emb_proj",
-    "out_layers.0": "norm2",
-    "out_layers.3": "conv2",
-    "skip_connection": "conv_shortcut",
-}
-_LDM_ENDS = {
-    "time_embed.0": "time_embedding.linear_1",
-    "time_embed.2": "time_embedding.linear_2",
-    "input_blocks.0.0": "conv_in",
-    "out.0": "conv_norm_out",
-    "out.2": "conv_out",
-}
-
-
-def _from_ldm(weights: dict[str, Tensor], file: Path) -> dict[str, Tensor]:
-    """Original (CompVis / Stability) U-Net keys -> diffusers keys."""
-    # A level of the down path ends with a downsampler: its position tells how many blocks a level has.
-    per_level = min(int(k.split(".")[1]) for k in weights if re.match(r"input_blocks\.\d+\.0\.op\.", k))
-    return {_ldm_key(name, per_level, file): value for name, value in weights.items()}
-
-
-def _ldm_key(name: str, per_level: int, file: Path) -> str:
-    for old, new in _LDM_ENDS.items():
-        if name.startswith(old + "."):
-            return new + name[len(old) :]
-    if match := re.match(r"(input|output)_blocks\.(\d+)\.(\d+)\.(.+)", name):
-        index, rest = int(match[2]) - (match[1] == "input"), match[4]
-        level, block = divmod(index, per_level)
-        side = "down_blocks" if match[1] == "input" else "up_blocks"
-        if rest.startswith("op."):
-            return f"{side}.{level}.downsamplers.0.conv.{rest[3:]}"
-        if re.match(r"conv\.(weight|bias)$", rest):
-            return f"{side}.{level}.upsamplers.0.{rest}"
-        where = f"{side}.{level}.{{}}.{block}"
-    elif match := re.match(r"middle_block\.(\d)\.(.+)", name):
-        rest = match[2]
-        where = f"mid_block.{{}}.{0 if match[1] == '1' else int(match[1]) // 2}"
-    else:
-        raise ValueError(f"Weight {name} of {file} is no part of a Stable Diffusion U-Net.")
-    for old, new in _LDM_RESNET.items():
-        if rest.startswith(old + "."):
-            return f"{where.format('resnets')}.{new}{rest[len(old) :]}"
-    return f"{where.format('attentions')}.{rest}"

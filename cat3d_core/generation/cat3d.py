@@ -12,14 +12,18 @@ import torch
 from torch import Tensor
 
 from cat3d_core.diffusion.config import ModelConfig, UNetConfig
+from cat3d_core.diffusion.memory import multiview_need
 from cat3d_core.diffusion.model import MultiViewModel
 from cat3d_core.diffusion.sampler import SamplerConfig, evaluations, sample
 from cat3d_core.diffusion.schedule import Schedule
-from cat3d_core.diffusion.unet import count_flops
+from cat3d_core.diffusion.unet import count_flops, count_parameters
 from cat3d_core.generation.advice import MEASURED, PAPER
 from cat3d_core.generation.memory import Memory
 from cat3d_core.generation.protocol import Cost, GeneratorSpec, ViewGroup
 from cat3d_core.rays import reference_from_image
+
+#: Weights of a network whose need of memory is looked at before it is loaded (a quarter of the paper's).
+_LARGE = 200_000_000
 
 
 def cat3d_spec(
@@ -40,6 +44,7 @@ def cat3d_spec(
         advice=replace(MEASURED, guidance=guidance, **told),
         reference=replace(PAPER, guidance=replace(PAPER.guidance, scale=guidance.scale)),
         cost=partial(_cost, config),
+        need=partial(multiview_need, config) if count_parameters(config.unet) > _LARGE else None,
     )
 
 

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
+import torch
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
+from cat3d_core.diffusion.memory import Need
 from cat3d_core.diffusion.sampler import SamplerConfig
 
 
@@ -31,6 +33,10 @@ class GeneratorSpec:
     height) of its images in pixels; latent_shape: (C, h, w) of one view. identity: hash of all that decides results;
     encoder_identity: of the part that makes latents. advice: how to sample with it; reference: how its authors do.
     cost(given, targets, sampler): of one group. wants: those of the optional fields of `ViewGroup` that it uses.
+    layout: how a plan groups views for it: "groups" as the paper does, or "windows", anchors along the path first and
+    then what lies between them, with captured views in each (`cat3d_core.windows`). terms: what its licence says
+    of what is made with it, in a sentence; empty: nothing that need be said. need(groups, dtype): memory of sampling so
+    many groups at once; None: so little that nobody asks.
     """
 
     views: int
@@ -43,6 +49,9 @@ class GeneratorSpec:
     reference: SamplerConfig
     cost: Callable[[int, int, SamplerConfig], Cost] = field(compare=False)
     wants: frozenset[str] = frozenset()
+    layout: Literal["groups", "windows"] = "groups"
+    terms: str = ""
+    need: Callable[[int, torch.dtype], Need] | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)
@@ -53,7 +62,8 @@ class ViewGroup:
     of the generator's size, in the scene frame (mean distance 1, +z up); noise (N, C, h, w) standard normal, a view's
     own whatever its group. Optional, for those who want it (`GeneratorSpec.wants`): images (M, 3, H, W) float32 in
     [0, 1] of the given views; scene: the cameras of all captured views; hints: maps (N, ..., H, W) by name of what is
-    known of the targets beforehand, such as the colours that a plane sweep of the given views finds.
+    known of the targets beforehand, such as the colours that a plane sweep of the given views finds; planned: the
+    cameras of all planned views of the same sample set.
     """
 
     latents: Tensor
@@ -62,6 +72,7 @@ class ViewGroup:
     images: Tensor | None = None
     scene: Cameras | None = None
     hints: Mapping[str, Tensor] = field(default_factory=dict)
+    planned: Cameras | None = None
 
     def __post_init__(self) -> None:
         given, targets = len(self.latents), len(self.noise)

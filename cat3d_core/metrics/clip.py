@@ -90,12 +90,17 @@ class ClipImageTower(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Embeddings of unit length (B, D) of images (B, 3, H, W) in [0, 1], of any size."""
-        x = self.conv1(prepared(images.to(self.proj.dtype), self.config.size)).flatten(2).mT
+        return F.normalize(self.embed(prepared(images.to(self.proj.dtype), self.config.size)), dim=-1)
+
+    def embed(self, images: Tensor) -> Tensor:
+        """Embeddings (B, D) as they come, of images (B, 3, size, size) normalised as CLIP's are."""
+        x = self.conv1(images).flatten(2).mT
         first = self.class_embedding.expand(len(x), 1, -1)
         x = self.ln_pre(torch.cat([first, x], dim=1) + self.positional_embedding)
         for block in self.blocks:
             x = block(x)
-        return F.normalize(self.ln_post(x[:, 0]) @ self.proj, dim=-1)
+        out: Tensor = self.ln_post(x[:, 0]) @ self.proj
+        return out
 
     def score(self, prediction: Tensor, target: Tensor) -> Tensor:
         """Cosine of the embeddings of each pair (B, 3, H, W): (B,), 1 for identical images."""
@@ -112,6 +117,11 @@ def prepared(images: Tensor, size: int) -> Tensor:
         images = F.interpolate(images, sides, mode="bicubic", antialias=True, align_corners=False).clamp(0.0, 1.0)
         top, left = ((side - size) // 2 for side in sides)
         images = images[:, :, top : top + size, left : left + size]
+    return normalized(images)
+
+
+def normalized(images: Tensor) -> Tensor:
+    """Images (B, 3, H, W) in [0, 1] less the mean and over the deviation of CLIP's training images."""
     mean, deviation = (images.new_tensor(v).view(1, 3, 1, 1) for v in (_MEAN, _DEVIATION))
     return (images - mean) / deviation
 
@@ -190,11 +200,12 @@ def _json(path: Path) -> dict[str, Any]:
     return document
 
 
-def load_clip(path: str | Path) -> ClipImageTower:
+def load_clip(path: str | Path, quick_gelu: bool | None = None) -> ClipImageTower:
     """The image tower in a file of weights (.safetensors, or .pt of plain tensors); the text tower is left.
 
-    Its name says its shape and, as models of one shape differ, the beginning of its weights' sha256. Raises ValueError
-    naming the file for anything that is no CLIP vision transformer.
+    quick_gelu: the activation where it is known beforehand; None: as the configuration beside the file says. Its name
+    says its shape and, as models of one shape differ, the beginning of its weights' sha256. Raises ValueError naming
+    the file for anything that is no CLIP vision transformer.
     """
     path = Path(path)
     state = _renamed(read_tensors(path))
@@ -202,16 +213,18 @@ def load_clip(path: str | Path) -> ClipImageTower:
     if any(key not in state for key in needed):
         raise ValueError(f"{path}: holds no image tower of CLIP (visual.* or vision_model.* with its projection).")
     config = _config(state, path.parent)
+    config = config if quick_gelu is None else replace(config, quick_gelu=quick_gelu)
     if config.width % config.heads:
         raise ValueError(f"{path}: {config.heads} heads don't divide the tower's width {config.width}.")
     digest = hashlib.sha256(b"".join(state[key].contiguous().numpy().tobytes() for key in ("conv1.weight", "proj")))
-    tower = ClipImageTower(config, f"{config.name} {digest.hexdigest()[:8]}")
+    with torch.device("meta"):  # a large tower is in memory once only
+        tower = ClipImageTower(config, f"{config.name} {digest.hexdigest()[:8]}")
     own = tower.state_dict()
     for key in sorted(own.keys() | state.keys()):
         if key not in own or key not in state or own[key].shape != state[key].shape:
             raise ValueError(f"{path}: looks like {config.name}, but {key} is missing, unknown or does not fit.")
-    tower.load_state_dict(state)
-    return tower.eval()
+    tower.load_state_dict(state, assign=True)
+    return tower.eval().requires_grad_(False)
 
 
 def find_clip() -> ClipImageTower | None:

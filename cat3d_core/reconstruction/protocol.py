@@ -31,7 +31,7 @@ class ReconstructionRequest:
 
     preset: name of a set of settings; overrides: those that the user gives. dataset: the scene's family (co3d, llff,
     ...), where a paper's settings depend on it. generated: whether views are generated. skip: the switches of the
-    configuration's section `skip`; one that is missing is off. depths: whether generated views come with depths.
+    configuration's section `skip`; one that is missing is off.
     """
 
     preset: str
@@ -39,7 +39,6 @@ class ReconstructionRequest:
     dataset: str = ""
     generated: bool = False
     skip: Mapping[str, bool] = field(default_factory=dict)
-    depths: bool = False
 
 
 @runtime_checkable

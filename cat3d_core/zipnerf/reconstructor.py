@@ -110,6 +110,11 @@ class ZipNerf:
 _: type[Reconstructor] = ZipNerf  # for the type checker: it keeps the protocol
 
 
+def _left_out(first: int, end: int, every: int) -> int:
+    """How many of the steps from `first` on, below `end`, are no multiple of `every`."""
+    return sum(step % every != 0 for step in range(first, end))
+
+
 def _skipped(trainer: Trainer) -> list[Decision]:
     """What the training did without."""
     config, steps, out = trainer.config, trainer.iteration, []
@@ -119,12 +124,13 @@ def _skipped(trainer: Trainer) -> list[Decision]:
 
     if config.low_resolution_iterations:
         half = min(steps, config.low_resolution_iterations)
-        skipped("low_resolution", f"Images of half the size in {half} of {steps} steps.")
+        skipped("low_resolution", f"Images of half the size in {half} of {steps} steps.", steps_at_full_size=half)
     if config.proposal_every > 1:
         text = f"Proposals were trained at every {config.proposal_every}th step after the warm-up."
-        skipped("proposals", text)
+        skipped("proposals", text, proposal_steps=_left_out(config.warmup_iterations, steps, config.proposal_every))
     if config.lpips_every > 1 and trainer.perceptual is not None:
-        skipped("lpips", f"The LPIPS loss was taken in one of {config.lpips_every} steps.")
+        text = f"The LPIPS loss was taken in one of {config.lpips_every} steps."
+        skipped("lpips", text, lpips_steps=_left_out(config.low_resolution_iterations, steps, config.lpips_every))
     if config.skip_transmittance:
         share = f"{config.skip_transmittance:g}"
         skipped("empty_space", f"The field was not asked where less than {share} of a ray's light is left.")

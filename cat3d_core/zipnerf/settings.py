@@ -30,8 +30,6 @@ GENERATED: dict[str, Any] = {"plateau_from": 0.4, "plateau_cooldown": 0.2}
 #: CAT3D: LPIPS weight 1 on CO3D and mip-NeRF 360, 0.25 elsewhere.
 STRONG_LPIPS = 4.0
 STRONG_LPIPS_DATASETS = ("co3d", "mip360", "mipnerf360")
-#: Where generated views come with depths; measured on the procedural families (docs/explanation/geometry.md).
-DEPTHS: dict[str, Any] = {"depth_prior": 0.1, "depth_prior_until": 0.6}
 #: Settings younger than stored fields: at their defaults they are left out of what identifies a field, so that those
 #: stay what is wanted.
 YOUNGER = ("depth_prior", "depth_prior_until")
@@ -62,8 +60,6 @@ def chosen_config(request: ReconstructionRequest) -> ZipNerfConfig:
         config = dataclasses.replace(config, lpips_weight=0.0)
     elif request.dataset in STRONG_LPIPS_DATASETS:
         config = dataclasses.replace(config, lpips_weight=STRONG_LPIPS * config.lpips_weight)
-    if request.depths:
-        config = dataclasses.replace(config, **DEPTHS)
     iterations = request.overrides.get("iterations", config.iterations)
     off = ZipNerfConfig()  # as in the paper: nothing is skipped
     for name, changes in skip_settings(iterations if isinstance(iterations, int) else config.iterations).items():
@@ -125,12 +121,12 @@ def fitted(
         changes |= PATIENT if captured > FEW_VIEWS else {}
     # The rays that left out pixels of generated views would have had go to captured ones.
     changes |= {"captured_share": max(config.captured_share, left_out(views))}
+    kept = set(given)
     rays, why = enough_rays(config, int(views.counting.sum()), captured < len(views))
-    if skip.get("rays") and rays < config.batch_rays:
+    if skip.get("rays") and rays < config.batch_rays and "batch_rays" not in kept:
         changes |= {"batch_rays": rays}
         text = f"{rays} instead of {config.batch_rays} rays a step: {why}."
         decisions.append(Decision("skipped", text, "rays", {"rays_a_step": config.batch_rays - rays}))
-    kept = set(given)
     config = dataclasses.replace(config, **{n: v for n, v in changes.items() if n not in kept})
     smallest = int(views.size.min())
     if config.patch_size > smallest:

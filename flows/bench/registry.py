@@ -19,7 +19,7 @@ from cat3d_core.generation.advice import MEASURED
 from cat3d_core.metrics.perceptual import find_perceptual
 from cat3d_core.weights import default_model_path
 from cat3d_core.zipnerf import PRESETS
-from flows.bench import metrics, plan, poses, reconstruct, sampler, scenes, skips, splats, store, synthetic
+from flows.bench import cameras, metrics, plan, poses, reconstruct, sampler, scenes, skips, splats, store, synthetic
 from flows.errors import InputError
 from flows.generation.formats import cat3d
 from flows.media.images import read_image
@@ -152,6 +152,15 @@ def pose_rows(quick: bool, data: Path | None) -> list[Row]:
     return _marked(rows, {"features": default})
 
 
+def camera_rows(quick: bool, data: Path | None) -> list[Row]:
+    """The scenes of `data` that have cameras, else procedural ones."""
+    sources: list[str | Path] = list(cameras.PROCEDURAL)
+    if data is not None:
+        known = [*poses.SCENES, "dtu_scan37", "re10k_bedroom", "mipnerf360_bonsai", "nerf_synthetic_lego"]
+        sources = list(_scenes(data, known[:1] if quick else known))
+    return cameras.rows(sources[:1] if quick else sources, trials=15 if quick else 105)
+
+
 def metric_rows(quick: bool, data: Path | None) -> list[Row]:
     rows = metrics.rows(2, 252, 336, 3) if quick else metrics.rows()
     return _marked(rows, {"implementation": "cat3d"})
@@ -245,6 +254,9 @@ BENCHES: dict[str, Bench] = {
         "camera estimation by its number of image features, against the known cameras of real scenes (needs --data)",
         pose_rows,
         (Panel("Poses", "seconds", "rotation_deg_median", ("features",), each=("scene",)),),
+    ),
+    "cameras": Bench(
+        "wrong given cameras: false alarms and seconds of the check, and which random damage it catches", camera_rows
     ),
     "metrics": Bench(
         "PSNR, SSIM and the perceptual distance beside other packages: seconds and rounding error",

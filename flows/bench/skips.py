@@ -70,7 +70,7 @@ def sources(data: Path | None, real: Sequence[str] = REAL) -> Iterator[tuple[str
 
 def longer_side(scene: Path) -> int:
     """The longer side of the scene's first photo, in pixels."""
-    from flows.media.images import image_size
+    from flows.media.files import image_size
 
     return max(image_size(read_capture(scene).paths[0]))
 

@@ -21,6 +21,7 @@ from flows.bench.fronts import cell, verdict
 from flows.bench.page import panels_of, tables, worth_showing, write_page
 from flows.bench.registry import BENCHES, MissingError, Row
 from flows.errors import InputError, describe
+from flows.jobs.device import cpu_count
 from flows.pipeline.versions import provenance
 from flows.progress import console
 from schemas.tables import append_rows
@@ -71,7 +72,7 @@ def measured(name: str, quick: bool, data: Path | None) -> list[Row]:
     with console.status(f"Benchmark {name}"):
         rows = BENCHES[name].run(quick, data)
     seconds, after = time.perf_counter() - started, os.getloadavg()[0]
-    threads, cores = torch.get_num_threads(), len(os.sched_getaffinity(0))
+    threads, cores = torch.get_num_threads(), cpu_count()
     busy = "; other jobs ran, so times are too long and unsteady" if max(before, after) > cores + 0.5 else ""
     run = {
         "bench": name,
@@ -93,7 +94,7 @@ def machine() -> str:
         model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), model)
     except OSError:
         pass
-    cores = len(os.sched_getaffinity(0))
+    cores = cpu_count()
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
     return f"{model}, {cores} cores, {platform.system()}, {gpu}"
 

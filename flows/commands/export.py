@@ -15,6 +15,7 @@ from flows.errors import InputError
 from flows.exports.dataset import write_dataset
 from flows.exports.mesh import fuse, without_crumbs, write_mesh_glb, write_mesh_ply
 from flows.exports.path import read_path, write_renders
+from flows.exports.plan import open_plan, write_plan_folder
 from flows.exports.ply import write_ply
 from flows.exports.source import Source, open_source, render_views, surface_cameras, training_images
 from flows.exports.splats import MOST, splats_of, write_splats
@@ -22,7 +23,7 @@ from flows.media.images import to_uint8
 from flows.open3d_import import import_open3d
 from flows.progress import console
 
-KINDS = ("mesh", "points", "splats", "dataset", "renders")
+KINDS = ("mesh", "points", "splats", "dataset", "renders", "plan")
 #: Points from which splats start: nerfstudio's and INRIA's trainers split and prune from there.
 DATASET_POINTS = 50_000
 
@@ -62,7 +63,7 @@ def export_command(
     settings: SurfaceSettings | None = None,
     path_file: Path | None = None,
 ) -> list[Path]:
-    """Write what is asked for (comma-separated KINDS; all but renders if empty) to `out`; the files and folders made.
+    """Write what is asked for (comma-separated KINDS; mesh, points and dataset if empty) to `out`; what was made.
 
     Raises InputError for everything a user can correct.
     """
@@ -70,6 +71,10 @@ def export_command(
     kinds = _kinds(what, path_file)
     if "mesh" in kinds:
         import_open3d("Meshes")  # before minutes of rendering
+    if "plan" in kinds:
+        _export_plan(path, run_name, frame, out)
+    if kinds == {"plan"}:
+        return [out / "plan"]
     source = open_source(path, run_name, frame)
     first = source.store.captured.read("size")[0].tolist()
     camera_path = read_path(path_file, *first) if path_file is not None else None
@@ -84,6 +89,14 @@ def export_command(
     for file in made:
         console.print(f"  {file}")
     return made
+
+
+def _export_plan(path: Path, run_name: str | None, frame: str, out: Path) -> None:
+    plan = open_plan(path, run_name, frame)
+    count = write_plan_folder(plan, out / "plan", path)
+    hints = "with hints from a reconstruction" if plan.scene else "without hints: no run reconstructed these photos yet"
+    console.print(f"plan: {count} planned views, {hints}")
+    console.print(f"  {out / 'plan'}")
 
 
 def _kinds(what: str, path_file: Path | None) -> set[str]:

@@ -1,17 +1,26 @@
-"""`cat3d models`: the diffusion models that are installed, and what a size of the network amounts to."""
+"""`cat3d models`: the models that are installed, and what a size of the diffusion network amounts to."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from rich.table import Table
 
 from cat3d_core.diffusion import SIZES, count_flops, count_parameters, describe
-from cat3d_core.weights import default_model_path
+from cat3d_core.diffusion.memory import Need, multiview_need
+from cat3d_core.matching.checkpoint import describe_sweep
+from cat3d_core.seva import network as seva_network
+from cat3d_core.seva.config import SevaConfig
+from cat3d_core.seva.generator import seva_spec
+from cat3d_core.weights import default_model_path, default_sweep_path
 from flows.errors import InputError
-from flows.generation.open import format_names
+from flows.generation.open import find_format, format_names, recognised
 from flows.progress import console
 
 
@@ -21,7 +30,7 @@ def models_command(describe_size: str | None, model: Path | None, as_json: bool)
         report = size_report(describe_size)
         print(json.dumps(report, indent=1)) if as_json else console.print(_pairs(report, f"size {describe_size}"))
         return
-    reports = [model_report(path) for path in installed() + ([model] if model else [])]
+    reports = [model_report(path) for path in installed() + ([model] if model else [])] + sweeps()
     if as_json:
         print(json.dumps(reports, indent=1))
         return
@@ -40,8 +49,22 @@ def installed() -> list[Path]:
         return []
 
 
+def sweeps() -> list[dict[str, Any]]:
+    """What the shipped plane sweep's file says of itself, where the installation carries it."""
+    try:
+        path = default_sweep_path()
+    except FileNotFoundError:
+        return []
+    return [{"path": str(path), "bytes": path.stat().st_size, **describe_sweep(path)}]
+
+
 def model_report(path: Path) -> dict[str, Any]:
-    """What a model file says of itself. Raises InputError for a file that is no model of ours."""
+    """What a model file says of itself. Raises InputError for a file that no generator recognises."""
+    if not path.exists():
+        raise InputError(f"There is no model file {path}.")
+    name = recognised(path)
+    if name != "cat3d":
+        return {"path": str(path), "generator": name, **_spec_report(name, path)}
     try:
         facts = describe(path)
     except (OSError, ValueError) as error:
@@ -49,16 +72,40 @@ def model_report(path: Path) -> dict[str, Any]:
     return {"path": str(path), "bytes": path.stat().st_size, **facts}
 
 
+def _spec_report(name: str, path: Path) -> dict[str, Any]:
+    try:
+        spec = find_format(name).describe(path)
+    except ValueError as error:
+        raise InputError(f"{path} can't be used as a model: {error}") from None
+    report: dict[str, Any] = {"terms": spec.terms} if spec.terms else {}
+    report |= {"views": spec.views, "image_size": list(spec.image_size), "sha256": spec.identity}
+    return report | {"memory_gib": _memory(spec.need)}
+
+
 def size_report(name: str) -> dict[str, Any]:
-    """Parameters and work of one of the built-in sizes, counted without allocating them."""
-    if name not in SIZES:
-        raise InputError(f"There is no size {name}; the sizes are {', '.join(SIZES)}.")
-    config = SIZES[name]
+    """Parameters, work and memory of one of the built-in sizes, or of SEVA, counted without allocating them."""
+    if name == "seva":
+        seva = SevaConfig()
+        counts = seva_network.count_parameters(seva), seva_network.count_flops(seva, seva.views)
+        need, document = seva_spec(seva).need, asdict(seva)
+    elif name in SIZES:
+        config = SIZES[name]
+        counts = count_parameters(config.unet), count_flops(config.unet)
+        need, document = partial(multiview_need, config), json.loads(config.to_json())
+    else:
+        raise InputError(f"There is no size {name}; the sizes are {', '.join([*SIZES, 'seva'])}.")
+    numbers = {"unet_parameters": counts[0], "tflop_per_evaluation": counts[1] / 1e12}
+    return {"size": name, **numbers, "memory_gib": _memory(need), "config": document}
+
+
+def _memory(need: Callable[[int, torch.dtype], Need] | None) -> dict[str, float]:
+    """GiB of weights and work for some numbers of groups sampled at once, by precision."""
+    if need is None:
+        return {}
     return {
-        "size": name,
-        "unet_parameters": count_parameters(config.unet),
-        "tflop_per_evaluation": count_flops(config.unet) / 1e12,
-        "config": json.loads(config.to_json()),
+        f"{groups} at once, {str(dtype).removeprefix('torch.')}": round(need(groups, dtype).total / 2**30, 1)
+        for dtype in (torch.float32, torch.bfloat16)
+        for groups in (1, 4)
     }
 
 

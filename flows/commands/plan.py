@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from rich.markup import escape
+
+from flows.generation.open import generator_spec
 from flows.generation.plan import read_plan
 from flows.jobs.job import Job
 from flows.jobs.request import Request
 from flows.media.plan_drawing import plan_table
+from flows.names import shown
 from flows.pipeline.runner import opened, run_missing
 from flows.progress import console
 from schemas.scene_store import SceneStore
@@ -16,8 +20,10 @@ def plan_command(request: Request, rows: int = 24) -> list[Job]:
 
     These stages are too short to need a server. Raises InputError, ConfigError and others.
     """
-    with console.status(f"Reading {request.source}"):
+    with console.status(f"Reading {escape(shown(request.source))}"):
         jobs = request.jobs()
+    if terms := generator_spec(jobs[0]).terms:
+        console.print(terms)
     with opened(jobs[0]):
         for job in jobs:
             run_missing(job, until="plan")
@@ -31,4 +37,4 @@ def show_plan(job: Job, rows: int) -> None:
     store = SceneStore.open(job.store_path)
     names = [str(name) for name in store.captured.read("name")]
     console.print(plan_table(read_plan(store.run(job.run).plan, len(names)), names, rows))
-    console.print(f"Picture: {job.pictures / 'plan.png'}")
+    console.print(f"Picture: {job.pictures / 'plan.png'}", markup=False)

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.markup import escape
+
+from flows.generation.imported import samples
+from flows.generation.opening import opening
 from flows.jobs.job import Job
 from flows.jobs.request import Request, make_request
-from flows.pipeline.keys import pending
+from flows.names import shown
+from flows.pipeline.keys import Step, pending
 from flows.progress import console
 
 DEMO_SOURCE = "procedural:co3d/4?views=16&width=96&height=96"
@@ -17,15 +23,18 @@ DEMO_SOURCE = "procedural:co3d/4?views=16&width=96&height=96"
 def run_command(request: Request) -> list[Job]:
     """Do everything that is not done yet for one scene and its splits. Raises InputError, ConfigError and others."""
     started, out = time.monotonic(), request.out
-    with console.status(f"Reading {request.source}"):
+    with console.status(f"Reading {escape(shown(request.source))}"):
         jobs = request.jobs()
         capture = jobs[0].capture()
         todo = {job.run: pending(job) for job in jobs}
-    console.print(f"{capture.scene_id}: {len(capture)} views ({capture.dataset})")
+    stored = f", stored as {capture.scene_id}" if capture.title != capture.scene_id else ""
+    console.print(f"{capture.title}: {len(capture)} views ({capture.dataset}{stored})", markup=False)
+    for sentence in dict.fromkeys(text for job in jobs for text in to_say(job, todo[job.run])):
+        console.print(sentence)
     for job in jobs:
         steps = todo[job.run]
         if steps:
-            console.print(f"  {job.run}: to do: " + ", ".join(f"{s.stage} ({s.why})" for s in steps))
+            console.print(f"  {job.run}: to do: " + ", ".join(f"{s.stage} ({s.why})" for s in steps), markup=False)
         else:
             console.print(f"  {job.run}: every stage is done already; nothing to do.")
     if any(todo.values()):
@@ -40,8 +49,14 @@ def run_command(request: Request) -> list[Job]:
 
     report = write_report(out, only_if_changed=not any(todo.values()))
     print_metrics(out, capture.scene_id)
-    console.print(f"Report: {report}  ({time.monotonic() - started:.0f} s)")
+    console.print(f"Report: {report}  ({time.monotonic() - started:.0f} s)", markup=False)
     return jobs
+
+
+def to_say(job: Job, steps: Sequence[Step]) -> list[str]:
+    """What is to be said of the job's generator, where one of the steps that are to be done loads it."""
+    loads = samples(job) and {"encode", "sample", "decode"} & {step.stage for step in steps}
+    return opening(job) if loads else []
 
 
 def demo_command(out: Path, smallest: bool) -> None:

@@ -6,13 +6,13 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from cat3d_core.cameras import Cameras
 from flows.errors import InputError
 from flows.exports.ply import write_bytes, write_ply
 from flows.media.images import write_png
 from flows.readers.parsing import from_opengl
+from flows.sfm.colmap import pycolmap
 
 
 def write_dataset(
@@ -36,29 +36,32 @@ def write_dataset(
     for name, image in zip(names, images, strict=True):
         write_png(folder / "images" / name, image)
     write_ply(folder / "sparse_pc.ply", points, normals, colours)
-    _write_transforms(folder, cameras, names, kinds, captured_name)
-    _write_colmap(folder / "sparse" / "0", cameras, names, points, colours)
+    files = [f"images/{name}" for name in names]
+    write_transforms(folder, cameras, files, kinds, captured_name, "sparse_pc.ply")
+    write_colmap(folder / "sparse" / "0", cameras, names, points, colours)
     return names
 
 
-def _write_transforms(
-    folder: Path, cameras: Cameras, names: list[str], kinds: list[str], captured_name: list[str | None]
-) -> None:
-    """transforms.json with intrinsics per frame and OpenGL camera axes (turning the axes is its own inverse)."""
+def write_transforms(
+    folder: Path, cameras: Cameras, files: list[str], kinds: list[str], captured_name: list[str | None],
+    points: str | None = None,
+) -> None:  # fmt: skip
+    """transforms.json with intrinsics per frame and OpenGL camera axes (turning the axes is its own inverse). files:
+    images, relative to the folder; kinds: what each is; points: a PLY file of points to start from."""
     poses = from_opengl(cameras.world_from_camera.double())
     frames = []
-    for i, name in enumerate(names):
+    for i, name in enumerate(files):
         k, (width, height) = cameras.intrinsics[i].double(), cameras.size[i].tolist()
         frames.append(
-            {"file_path": f"images/{name}", "w": width, "h": height, "fl_x": float(k[0, 0]), "fl_y": float(k[1, 1]),
+            {"file_path": name, "w": width, "h": height, "fl_x": float(k[0, 0]), "fl_y": float(k[1, 1]),
              "cx": float(k[0, 2]), "cy": float(k[1, 2]), "transform_matrix": poses[i].tolist(), "kind": kinds[i],
              "source_name": captured_name[i]}
         )  # fmt: skip
-    document = {"camera_model": "PINHOLE", "ply_file_path": "sparse_pc.ply", "frames": frames}
+    document = {"camera_model": "PINHOLE"} | ({"ply_file_path": points} if points else {}) | {"frames": frames}
     write_bytes(folder / "transforms.json", json.dumps(document, indent=1).encode())
 
 
-def _write_colmap(folder: Path, cameras: Cameras, names: list[str], points: np.ndarray, colours: np.ndarray) -> None:
+def write_colmap(folder: Path, cameras: Cameras, names: list[str], points: np.ndarray, colours: np.ndarray) -> None:
     """Text model: one PINHOLE camera per different lens, images without keypoints, points without tracks."""
     model = pycolmap.Reconstruction()
     lenses: dict[tuple[float, ...], int] = {}

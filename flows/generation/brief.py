@@ -8,7 +8,7 @@ from torch import Tensor
 from cat3d_core.cameras import Cameras
 from cat3d_core.reconstruction import Reconstructor, Render, Views
 from cat3d_core.uncertainty import shown_by
-from flows.jobs.device import cpu_threads, device
+from flows.jobs.device import cpu_threads, exact_device
 from flows.jobs.job import Job
 from flows.reconstruction.open import brief_reconstructor
 
@@ -22,7 +22,7 @@ def brief_reconstruction(job: Job, views: Views) -> Reconstructor:
     """The views, reconstructed as quickly as the job's method does."""
     brief = brief_reconstructor(job)
     with cpu_threads(job.config.execution.threads):
-        brief.start(views, job.config.seed, device())
+        brief.start(views, job.config.seed, exact_device())
         while not brief.finished:
             brief.step()
     return brief

@@ -64,7 +64,12 @@ class StoredPlan:
             noise=self.noise(group, generator.spec.latent_shape),
             images=self._images(group, latents, generator) if "images" in generator.spec.wants else None,
             scene=self.captured[group.kind],
+            planned=self._planned(group.kind) if "planned" in generator.spec.wants else None,
         )
+
+    def _planned(self, kind: str) -> Cameras:
+        """The cameras of all planned views of a sample set."""
+        return self.cameras[(self.plan.sample_kind == KINDS.index(kind)).nonzero()[:, 0]]
 
     def _images(self, group: Group, latents: Tensor, generator: Generator) -> Tensor:
         """(M, 3, H, W) in [0, 1]: captured views as they were encoded, anchors decoded."""

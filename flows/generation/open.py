@@ -18,8 +18,10 @@ from flows.jobs.device import device, free_device_memory
 from flows.jobs.job import Job
 
 GROUP = "cat3d.generators"
+#: The one without a file.
+DEFAULT = "cat3d"
 #: Our own formats, in the order in which they are tried: names in `flows/generation/formats/`.
-FORMATS = ("cat3d",)
+FORMATS = ("seva", "cat3d")
 
 
 class Format(Protocol):
@@ -93,7 +95,7 @@ def _kind(job: Job) -> tuple[str, Path | None]:
     """The format of the job's generator and its resolved path."""
     name, path = job.config.sample.generator, job.config.sample.checkpoint
     if path is None:
-        return name or FORMATS[0], None
+        return name or DEFAULT, None
     if not path.exists():
         raise InputError(f"sample.checkpoint: there is no model file {path}.")
     path = path.resolve()

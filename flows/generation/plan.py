@@ -37,6 +37,7 @@ def write_plan(section: Section, plan: Plan) -> None:
         recipe=plan.recipe,
         reasons=plan.reasons,
         needed=plan.needed,
+        dropped=plan.dropped,
         image_size=int(plan.cameras.size[0, 0]),
         kinds=[kind for kind in KINDS if any(group.kind == kind for group in plan.groups)],
         captured_count=plan.captured_count,
@@ -73,6 +74,7 @@ def read_plan(section: Section, captured_count: int) -> Plan:
         captured_coverage=Coverage(**attributes["captured_coverage"]),
         plan_coverage=Coverage(**attributes["plan_coverage"]),
         needed=attributes["needed"],
+        dropped=attributes.get("dropped", 0),
     )
 
 

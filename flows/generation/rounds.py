@@ -45,7 +45,7 @@ class OneRound:
     def __init__(self, plan: StoredPlan) -> None:
         self.passes = plan.passes()
         self.kept = [g for items in self.passes for g in items]
-        none = skipped("Sampled nothing: captured views cover the path.", "covered_path", views=len(plan))
+        none = skipped("Sampled nothing: captured views cover the path.", "covered_path")
         self.decisions = [] if plan.needed else [none]
 
     def __iter__(self) -> Iterator[list[list[int]]]:

@@ -14,13 +14,14 @@ from schemas.errors import ConfigError
 _CHOSEN = ("solver", "nodes", "steps")
 
 
-def sampler_config(job: Job) -> SamplerConfig:
+def sampler_config(job: Job, shortened: bool | None = None) -> SamplerConfig:
     """Solver, nodes, steps and guidance: the run's own where given, else the generator's advice; without `skip.solver`
     its authors' sampler, except for guidance, which is no skip and stays the generator's. Without `skip.guidance`, or
-    where guidance changes nothing, it has no interval. Raises ConfigError for a sampler that doesn't exist.
+    where guidance changes nothing, it has no interval. shortened: in place of `skip.solver`. Raises ConfigError for a
+    sampler that doesn't exist.
     """
     settings, skip, spec = job.config.sample, job.config.skip, generator_spec(job)
-    base = spec.advice if skip.solver else spec.reference
+    base = spec.advice if (skip.solver if shortened is None else shortened) else spec.reference
     advised = spec.advice.guidance
     scale = advised.scale if settings.guidance is None else settings.guidance
     low, high = -math.inf, math.inf

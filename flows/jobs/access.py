@@ -58,3 +58,11 @@ def views_with_role(store: SceneStore, run: Run, role: str) -> list[int]:
 def read_images(section: Section, views: Sequence[int]) -> list[torch.Tensor]:
     """Images of the views, each (h, w, 3) uint8 without padding."""
     return [torch.from_numpy(np.ascontiguousarray(section.read_image("image", v))) for v in views]
+
+
+def read_masks(store: SceneStore, views: Sequence[int]) -> list[torch.Tensor | None] | None:
+    """Masks (h, w) bool of the views, False where a pixel must not be trained on; None where the scene has no such
+    masks (masks that only say what an object is, such as DTU's, are for the metrics)."""
+    if not store.captured.attrs.get("mask_training") or "mask" not in store.captured:
+        return None
+    return [torch.from_numpy(store.captured.read_image("mask", v) >= 128) for v in views]

@@ -33,7 +33,7 @@ class Job(BaseModel):
     _scene: Scene = PrivateAttr()
 
     def model_post_init(self, _context: Any) -> None:
-        self._scene = Scene(self.source, self.reader, self.image_folder)
+        self._scene = Scene(self.source, self.reader, self.image_folder, self.config.ingest.frames)
 
     @property
     def store_path(self) -> Path:

@@ -10,6 +10,7 @@ from typing import Any
 from cat3d_core.diffusion.solvers import check_solver
 from flows.jobs.job import Job
 from flows.jobs.scene import Scene
+from flows.names import source_text
 from schemas.config import RunConfig, load_config, parse_config
 from schemas.errors import ConfigError
 from schemas.settings import merged, set_at, settings_document, value_at
@@ -47,7 +48,8 @@ class Request:
                 check_solver(self.config.sample.solver)
             except ValueError as error:
                 raise ConfigError(f"sample.solver: {error}") from None
-        scene = scene or Scene(self.source, self.reader, self.image_folder)
+        text = source_text(absolute(self.source))
+        scene = scene or Scene(text, self.reader, self.image_folder, self.config.ingest.frames)
         jobs = []
         for split in self.views:
             job = Job(
@@ -65,6 +67,12 @@ class Request:
                 job = job.model_copy(update={"config": config})
             jobs.append(job)
         return jobs
+
+
+def absolute(source: str) -> str:
+    """A folder or file as it is found from anywhere, so that a store can be looked at from another folder; what is no
+    path that exists, such as procedural:llff/1, stays."""
+    return str(Path(source).absolute()) if Path(source).exists() else source
 
 
 def make_request(

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from flows.readers.base import Capture, read_capture
-from schemas.content_key import array_digest
+from flows.readers.base import FRAMES, Capture, read_capture
+from schemas.content_key import array_digest, file_sha256
 
 
 @dataclass(frozen=True)
@@ -21,11 +19,12 @@ class Scene:
     source: str
     reader: str = "auto"
     image_folder: str | None = None
+    frames: int = FRAMES
 
     @cached_property
     def capture(self) -> Capture:
         """The scene as its reader found it. Raises InputError for everything a user can correct."""
-        return read_capture(self.source, self.reader, self.image_folder)
+        return read_capture(self.source, self.reader, self.image_folder, frames=self.frames)
 
     @cached_property
     def digests(self) -> dict[str, Any]:
@@ -47,22 +46,23 @@ def capture_digests(capture: Capture) -> dict[str, Any]:
     def digest(tensor: Tensor | None) -> str | None:
         return None if tensor is None else array_digest(tensor.numpy())
 
+    # Only where they say something, so that the keys of all other scenes stay what they were.
+    unusual: dict[str, Any] = {} if capture.upright else {"upright": False}
+    if capture.fisheye is not None:
+        unusual["fisheye"] = digest(capture.fisheye)
+    if capture.mask_training:
+        unusual["mask_training"] = True
     return {
         "images": images,
         "lens": {
             "intrinsics": digest(cameras.intrinsics) if cameras else None,
             "distortion": digest(capture.distortion),
             "masks": masks,
-        },
+        }
+        | unusual,
         "cameras": {
             "poses": digest(cameras.world_from_camera) if cameras else None,
             "points": digest(capture.points),
             "depth_bounds": digest(capture.depth_bounds),
         },
     }
-
-
-def file_sha256(path: Path) -> str:
-    """sha256 of a file's bytes, hexadecimal."""
-    with open(path, "rb") as f:
-        return hashlib.file_digest(f, "sha256").hexdigest()

@@ -7,8 +7,9 @@ area, as `Cameras.resize` does, and `undistort` keeps the image size and returns
 from __future__ import annotations
 
 import os
+import re
+import threading
 from collections.abc import Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,56 +20,28 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from flows.errors import InputError
+from flows.media.files import MAX_PIXELS, first_line, opened, plain_folder
 from flows.media.lens import distorted_pixels, filling_zoom
 
-MAX_PIXELS = 100_000_000
 #: sRGB grey around images that are padded to squares: the middle of the range the autoencoder knows.
 PADDING = 128
-EXTENSIONS = frozenset(
-    ["jpg", "jpeg", "png", "webp", "tif", "tiff", "bmp", "exr", "hdr", "jp2", "jxl", "ppm", "pgm", "tga", "gif"]
-)
-UNSUPPORTED = {
-    **dict.fromkeys(["heic", "heif", "avif"], "HEIC/AVIF"),
-    **dict.fromkeys(["cr2", "cr3", "nef", "arw", "dng", "raf", "orf", "rw2"], "camera RAW"),
-}
-
-
-def list_images(folder: Path) -> list[Path]:
-    """Image files (by extension, HEIC and RAW included so that they are named, not skipped) in sorted order."""
-    known = EXTENSIONS | UNSUPPORTED.keys()
-    files = (p for p in folder.iterdir() if p.suffix[1:].lower() in known and not p.name.startswith("."))
-    return sorted(p for p in files if p.is_file())
-
-
-def image_size(path: Path | str, max_pixels: int = MAX_PIXELS) -> tuple[int, int]:
-    """(width, height) in pixels of the upright image, from its header alone. Raises InputError as `read_image` does."""
-    with _opened(Path(path), max_pixels) as source:
-        spec = source.spec()
-        turned = spec.get_int_attribute("Orientation", 1) >= 5
-        return (spec.height, spec.width) if turned else (spec.width, spec.height)
-
-
-def exif_focal_px(path: Path | str) -> float | None:
-    """Focal length in pixels from EXIF's 35 mm equivalent (36 mm = the long side), None where it isn't recorded."""
-    with _opened(Path(path), MAX_PIXELS) as source:
-        spec = source.spec()
-        equivalent_mm = spec.get_float_attribute("Exif:FocalLengthIn35mmFilm", 0.0)
-        return equivalent_mm / 36.0 * max(spec.width, spec.height) if equivalent_mm > 0 else None
 
 
 def read_image(
-    path: Path | str, max_pixels: int = MAX_PIXELS, background: float | None = 1.0
+    path: Path | str, max_pixels: int = MAX_PIXELS, background: float | None = 1.0, upright: bool = True
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Decode an image file to upright sRGB: (H, W, 3) uint8, and its alpha (H, W) uint8 or None where it has none.
+    """Decode an image file to sRGB: (H, W, 3) uint8, and its alpha (H, W) uint8 or None where it has none.
+
+    upright: turn it by its EXIF orientation; False keeps the pixels as they are stored, as COLMAP and its like do.
 
     16-bit files are rounded; floating-point files (EXR, HDR) are linear Rec. 709 by definition: encoded to sRGB and
     clipped. Transparency is composited, in sRGB values as NeRF's synthetic scenes do, on a grey of `background`
     (1 = white); None leaves the unassociated colours as they are in the file. Grey and palette become RGB.
-    Raises InputError naming the file: missing, empty, truncated, not an image, CMYK, HEIC or RAW, more than
+    Raises InputError naming the file: missing, empty, truncated, not an image, CMYK, RAW, more than
     `max_pixels` (checked before decoding), NaN.
     """
     path = Path(path)
-    with _opened(path, max_pixels) as source:
+    with opened(path, max_pixels) as source:
         spec = source.spec()
         channels = list(spec.channelnames)
         is_float = str(spec.format) in ("half", "float", "double")
@@ -77,7 +50,7 @@ def read_image(
         orientation = spec.get_int_attribute("Orientation", 1)
     # A truncated JPEG comes back as an array, and only the error text tells.
     if pixels is None or error:
-        raise InputError(f"{path} is damaged or incomplete ({_first_line(error)}); copy it again or remove it.")
+        raise InputError(f"{path} is damaged or incomplete ({first_line(error)}); copy it again or remove it.")
     colour_ids, alpha_id = _channel_ids(channels, path)
     if is_float:
         if not np.isfinite(pixels).all():
@@ -87,7 +60,8 @@ def read_image(
             if alpha_id is not None
             else (_srgb_encoded(pixels))
         )
-    pixels = _upright(pixels, orientation)
+    if upright:
+        pixels = _upright(pixels, orientation)
     rgb = pixels[..., colour_ids]
     alpha = None if alpha_id is None else pixels[..., alpha_id]
     if alpha is not None and background is not None:
@@ -96,9 +70,9 @@ def read_image(
     return np.ascontiguousarray(to_uint8(rgb)), None if alpha is None else np.ascontiguousarray(to_uint8(alpha))
 
 
-def read_mask(path: Path | str) -> np.ndarray:
-    """(H, W) uint8, 255 where the mask image is at least half white."""
-    rgb, alpha = read_image(path, background=None)
+def read_mask(path: Path | str, upright: bool = True) -> np.ndarray:
+    """(H, W) uint8, 255 where the mask image is at least half white; upright as for `read_image`."""
+    rgb, alpha = read_image(path, background=None, upright=upright)
     return np.where((rgb.max(-1) if alpha is None else np.minimum(rgb.max(-1), alpha)) >= 128, 255, 0).astype(np.uint8)
 
 
@@ -141,23 +115,23 @@ def square_image(image: np.ndarray, box: Sequence[int], image_size: int) -> np.n
 
 
 def undistort(
-    image: np.ndarray, intrinsics: Tensor, distortion: Tensor, nearest: bool = False
+    image: np.ndarray, intrinsics: Tensor, distortion: Tensor, nearest: bool = False, fisheye: bool = False
 ) -> tuple[np.ndarray, Tensor]:
     """The image a pinhole camera would have taken: same size, and its intrinsics (3, 3) float64.
 
-    image (H, W, C) or (H, W) uint8; intrinsics (3, 3) of this image; distortion (5) as in `lens.distort`. Size and
-    principal point stay; one zoom of the focal lengths is chosen as the smallest with no pixel outside the photo, so
-    there is no black border and nearly the whole view stays. Own inverse warp: cubic sampling (`nearest` for masks).
+    image (H, W, C) or (H, W) uint8; intrinsics (3, 3) of this image; distortion and fisheye as in `lens.distort`. Size
+    and principal point stay; one zoom of the focal lengths is chosen as the smallest with no pixel outside the photo,
+    so there is no black border and nearly the whole view stays. Own inverse warp: cubic sampling (`nearest` for masks).
     Raises InputError where no moderate zoom does it (coefficients that no lens has).
     """
     intrinsics = intrinsics.double()
-    if not distortion.any():
+    if not distortion.any() and not fisheye:
         return image, intrinsics
     height, width = image.shape[:2]
     new = intrinsics.clone()
-    new[0, 0], new[1, 1] = intrinsics[[0, 1], [0, 1]] * filling_zoom(intrinsics, distortion, width, height)
+    new[0, 0], new[1, 1] = intrinsics[[0, 1], [0, 1]] * filling_zoom(intrinsics, distortion, width, height, fisheye)
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    source = distorted_pixels(torch.stack([columns, rows], -1).double(), new, intrinsics, distortion)
+    source = distorted_pixels(torch.stack([columns, rows], -1).double(), new, intrinsics, distortion, fisheye)
     # In grid_sample without align_corners -1 to 1 is the area of the image.
     grid = (2 * source / torch.tensor([width, height]) - 1).float()
     mode = "nearest" if nearest else "bicubic"
@@ -173,39 +147,6 @@ def write_png(path: Path | str, image: np.ndarray | Tensor) -> None:
 def write_jpeg(path: Path | str, image: np.ndarray | Tensor, quality: int = 93) -> None:
     """Write an image as JPEG, without alpha or chroma subsampling (4:4:4); otherwise like `write_png`."""
     _write(Path(path), to_uint8(image), {"Compression": f"jpeg:{quality}", "jpeg:subsampling": "4:4:4"})
-
-
-@contextmanager
-def _opened(path: Path, max_pixels: int) -> Any:
-    """An open OpenImageIO input whose header passed every check."""
-    kind = UNSUPPORTED.get(path.suffix[1:].lower())
-    if not path.is_file():
-        raise InputError(f"Image file {path} does not exist.")
-    if kind:
-        raise InputError(f"{path} is a {kind} file, which cannot be read here; convert it to JPEG or PNG.")
-    if path.stat().st_size == 0:
-        raise InputError(f"{path} is empty (0 bytes); copy it again or remove it.")
-    config = oiio.ImageSpec()
-    config["oiio:UnassociatedAlpha"] = 1
-    source = oiio.ImageInput.open(str(path), config)
-    if source is None:
-        raise InputError(f"{path} is not an image that can be read ({_first_line(oiio.geterror())}).")
-    try:
-        spec = source.spec()
-        if spec.width * spec.height > max_pixels:
-            raise InputError(
-                f"{path} has {spec.width} x {spec.height} pixels, more than the bound of {max_pixels / 1e6:g} million; "
-                "make it smaller first."
-            )
-        if "CMYK" in {spec.get_string_attribute(f"{f}:ColorSpace") for f in ("jpeg", "tiff")}:
-            raise InputError(f"{path} is a CMYK image (made for printing); convert it to sRGB first.")
-        yield source
-    finally:
-        source.close()
-
-
-def _first_line(error: str) -> str:
-    return error.strip().splitlines()[0] if error.strip() else "no reason given"
 
 
 def _channel_ids(channels: list[str], path: Path) -> tuple[list[int], int | None]:
@@ -246,17 +187,18 @@ def _from_planes(planes: Tensor, ndim: int) -> np.ndarray:
 
 def _write(path: Path, pixels: np.ndarray, attributes: dict[str, Any]) -> None:
     pixels = np.ascontiguousarray(pixels if pixels.ndim == 3 else pixels[..., None])
-    partial = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "uint8")
     for name, value in (attributes | {"oiio:UnassociatedAlpha": 1}).items():
         spec[name] = value
-    target = oiio.ImageOutput.create(str(partial))
-    if target is None:
-        raise InputError(f"{path} has no extension of an image format; end it in .png or .jpg.")
-    try:
-        written = target.open(str(partial), spec) and target.write_image(pixels)
-        if not (target.close() and written):
-            raise InputError(f"{path} cannot be written ({_first_line(target.geterror())}).")
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with plain_folder(path.parent) as folder:
+        partial = folder / f".cat3d-{os.getpid()}-{threading.get_ident()}{path.suffix}"
+        target = oiio.ImageOutput.create(str(partial)) if re.fullmatch(r"\.[A-Za-z0-9]+", path.suffix) else None
+        if target is None:
+            raise InputError(f"{path} has no extension of an image format; end it in .png or .jpg.")
+        try:
+            written = target.open(str(partial), spec) and target.write_image(pixels)
+            if not (target.close() and written):
+                raise InputError(f"{path} cannot be written ({first_line(target.geterror())}).")
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)

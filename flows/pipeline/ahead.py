@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 
 from flows.errors import describe
+from flows.generation.imported import samples
 from flows.jobs.job import Job
 from flows.pipeline.keys import expected_steps, pending, stage
 from flows.pipeline.runner import opened, run_missing, write_timing
@@ -27,7 +28,7 @@ def sample_ahead(jobs: Sequence[Job]) -> Totals:
 
     What fails here is said and left to the scene's own flow, which will meet the same error and report it.
     """
-    generative = [job for job in jobs if job.generates]
+    generative = [job for job in jobs if samples(job)]
     with contextlib.ExitStack() as stores:
         works: list[Work] = []
         for path in dict.fromkeys(job.store_path for job in generative):

@@ -7,6 +7,7 @@ import platform
 import time
 from collections.abc import Callable, Iterator
 from datetime import datetime
+from pathlib import Path
 
 import numpy as np
 
@@ -54,7 +55,7 @@ def execute_stage(job: Job, step: Step) -> StageRecord:
     store.complete(step.stage, record, job.run)
     write_timing(job, record, usage.with_(outcome.usage))
     for decision in outcome.decisions:
-        console.print(f"  [dim]{decision.text}[/dim]")
+        console.print(f"  {decision.text}", style="dim", markup=False)
     return record
 
 
@@ -95,10 +96,34 @@ def ensure_store(job: Job) -> None:
                 f"{job.store_path} holds a scene of {store.dataset}, this one is of {job.dataset}; "
                 "choose another --out."
             )
+        check_source(store, job)
         store.sweep()
         return
     job.out.mkdir(parents=True, exist_ok=True)
     SceneStore.create(job.store_path, job.scene_id, job.dataset, provenance() | {"source": job.source})
+
+
+def check_source(store: SceneStore, job: Job) -> None:
+    """Refuse to write another scene's results over a stored one that has the same name.
+
+    A scene that was moved, or whose photos were added to or replaced in part, is the same one: it lies where it lay, or
+    some photo is the same. Raises StoreError.
+    """
+    before = store.attrs["provenance"].get("source")
+    record = store.record("ingest")
+    if before is None or record is None or _place(before) == _place(job.source):
+        return
+    known = set(record.inputs.get("images", {}).values())
+    if known.isdisjoint(job.scene.digests["images"].values()):
+        raise StoreError(
+            f"{job.store_path} holds the scene of {before}, and {job.source} is another one of the same name: choose "
+            "another --out, or rename the folder."
+        )
+
+
+def _place(source: str) -> str:
+    """Where a source lies, however it is written."""
+    return source if source.startswith("procedural:") else str(Path(source).resolve())
 
 
 def prepare_run(job: Job) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
+from rich.markup import escape
 
 from flows.jobs.job import Job
 from flows.pipeline.keys import Step
@@ -43,7 +44,7 @@ def run_jobs(jobs: Sequence[Job]) -> list[StageRecord]:
     """What `scene_flow` does, inside whichever flow calls it: the jobs of one scene, each missing stage a task."""
 
     def execute(job: Job, step: Step) -> StageRecord:
-        console.print(f"[bold]{step.stage}[/bold] {job.scene_id} {job.run} ({step.why})")
+        console.print(f"[bold]{step.stage}[/bold] {job.scene_id} {job.run} ({escape(step.why)})")
         record: StageRecord = run_stage(job, step)
         return record
 

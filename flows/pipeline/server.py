@@ -42,7 +42,15 @@ def quiet_environment(home: Path) -> dict[str, str]:
         "PREFECT_SERVER_UI_ENABLED": os.environ.get("PREFECT_SERVER_UI_ENABLED", "false"),
         "PREFECT_TASKS_DEFAULT_NO_CACHE": "true",  # the store is the truth of what is done
         "PREFECT_TASKS_DEFAULT_PERSIST_RESULT": "false",
+        # A company's proxy does not know this machine's own addresses.
+        **dict.fromkeys(("NO_PROXY", "no_proxy"), _without_proxy()),
     }
+
+
+def _without_proxy() -> str:
+    """The hosts that are reached directly: those of the environment, and this machine."""
+    given = os.environ.get("no_proxy") or os.environ.get("NO_PROXY") or ""
+    return ",".join([*filter(None, (host.strip() for host in given.split(","))), "127.0.0.1", "localhost"])
 
 
 @contextlib.contextmanager
@@ -59,10 +67,14 @@ def prefect_server(home: Path) -> Iterator[str]:
         return
     home.mkdir(parents=True, exist_ok=True)
     environment = quiet_environment(home)
-    before = {name: os.environ.get(name) for name in [*environment, "PREFECT_API_URL"]}
+    # The user's own settings of Prefect (a base path, a database, a profile) are for the user's server.
+    theirs = [name for name in os.environ if name.startswith("PREFECT_") and name not in environment]
+    before = {name: os.environ.get(name) for name in [*environment, *theirs, "PREFECT_API_URL"]}
+    for name in theirs:
+        del os.environ[name]
     os.environ.update(environment)
     template = _template_path()
-    if not (home / "prefect.db").exists() and template.exists():
+    if template is not None and not (home / "prefect.db").exists() and template.exists():
         shutil.copyfile(template, home / "prefect.db")
     port = _free_port()
     url = f"http://127.0.0.1:{port}/api"
@@ -79,7 +91,8 @@ def prefect_server(home: Path) -> Iterator[str]:
             _wait_until_healthy(url, process, START_TIMEOUT_S)
         except ServerError as error:
             raise ServerError(f"{error} Its log is {log_path}.") from None
-        _save_template(home / "prefect.db", template)
+        if template is not None:
+            _save_template(home / "prefect.db", template)
         os.environ["PREFECT_API_URL"] = url
         with _settings_of_environment():
             yield url
@@ -156,10 +169,14 @@ def _stop(process: subprocess.Popen) -> None:
         process.wait()
 
 
-def _template_path() -> Path:
+def _template_path() -> Path | None:
+    """Where the empty database is kept for the next server; None where there is no home, as in some containers."""
     import importlib.metadata
 
-    cache = Path(os.environ.get("CAT3D_CACHE", Path.home() / ".cache" / "cat3d"))
+    try:
+        cache = Path(os.environ.get("CAT3D_CACHE") or Path.home() / ".cache" / "cat3d")
+    except RuntimeError:
+        return None
     return cache / f"prefect-{importlib.metadata.version('prefect')}.db"
 
 

@@ -16,11 +16,12 @@ import torch
 from torch import Tensor
 
 from flows.errors import InputError
-from flows.media.images import image_size
 from flows.readers import splits
-from flows.readers.base import Capture, inside
+from flows.readers.base import Capture
+from flows.readers.matching import Finder, left_out
 from flows.readers.parsing import (
     cameras_for_files,
+    files_size,
     from_camera_from_world,
     images_in,
     load_arrays,
@@ -31,6 +32,7 @@ from flows.readers.parsing import (
 
 LOOKS_FOR = "gt_cameras.npz, or frame_annotations.jgz in the folder above (CO3D)"
 ANNOTATIONS = "frame_annotations.jgz"
+READ_KEYS = {"sequence_name", "frame_number", "frame_timestamp", "image", "mask", "viewpoint"}
 
 
 def detect(path: Path) -> bool:
@@ -62,26 +64,43 @@ def _read_npz(path: Path, image_folder: str | None) -> Capture:
     names = [p.name for p in paths]
     count = len(paths)
     arrays = load_arrays(source, ["gtR", "gtT", "gtFL"])
+    if len(arrays["gtR"]) != count:
+        raise InputError(
+            f"{source} has {len(arrays['gtR'])} cameras (gtR) for the {count} images of {path / folder}; it says "
+            "nothing of their names, so there must be one for each image, in sorted order. Remove images "
+            "without a camera."
+        )
     rotation = numbers(arrays["gtR"], (count, 3, 3), "gtR (one rotation per image)", source)
     translation = numbers(arrays["gtT"], (count, 3), "gtT (one translation per image)", source)
     focal = numbers(arrays["gtFL"], (count, 2), "gtFL (two focal lengths per image)", source)
-    size = torch.tensor([image_size(p) for p in paths], dtype=torch.float64)
+    size = files_size(paths).double()
     intrinsics = torch.stack([_intrinsics(f, [0.0, 0.0], s, "ndc_isotropic") for f, s in zip(focal, size, strict=True)])
     notes: list[str] = []
-    cameras = cameras_for_files(intrinsics, size, from_pytorch3d(rotation, translation), paths, names, source, notes)
-    return Capture(path.resolve().name, "co3d", names, paths, cameras=cameras, notes=notes)
+    unused = sorted(set(load_arrays(source, [])) - {"gtR", "gtT", "gtFL"})
+    if unused:
+        notes.append(f"Of the arrays of {source.name} these are not used: {', '.join(unused)}.")
+    placed = cameras_for_files(intrinsics, size, from_pytorch3d(rotation, translation), paths, names, source, notes)
+    return Capture(
+        path.resolve().name, "co3d", names, paths, cameras=placed.cameras, upright=placed.upright, notes=notes
+    )
 
 
 def _read_annotations(path: Path) -> Capture:
     sequence, category = path.resolve(), path.resolve().parent
     root, source = category.parent, category / ANNOTATIONS
     frames = sorted(_annotated_frames(source, sequence.name), key=lambda f: f["image"]["path"])
-    present = [f for f in frames if inside(root, f["image"]["path"], source).is_file()]
-    missing = [f["image"]["path"] for f in frames if f not in present]
+    finder = Finder(root, source)
+    files = dict(zip(map(id, frames), finder.find_all([f["image"]["path"] for f in frames]), strict=True))
+    present = [f for f in frames if files[id(f)] is not None]
+    missing = [f["image"]["path"] for f in frames if files[id(f)] is None]
     if not present:
         raise InputError(f"{source} lists {len(frames)} frames of {sequence.name}, but none of their images exists.")
     notes = [unlisted_note(len(missing), "frames whose image is missing were", missing)] if missing else []
-    paths = [root / f["image"]["path"] for f in present]
+    paths = [path for path in files.values() if path is not None]
+    beside = left_out(sequence / "images", paths, root) if (sequence / "images").is_dir() else []
+    if beside:
+        notes.append(unlisted_note(len(beside), "images that no frame names were", beside))
+    notes += [*finder.notes(), *_ignored(present, category)]
     names = [p.name for p in paths]
     views = [f["viewpoint"] for f in present]
     size = torch.tensor([f["image"]["size"][::-1] for f in present], dtype=torch.float64)
@@ -93,12 +112,33 @@ def _read_annotations(path: Path) -> Capture:
     )
     rotation = numbers([v["R"] for v in views], (len(views), 3, 3), "R", source)
     translation = numbers([v["T"] for v in views], (len(views), 3), "T", source)
-    cameras = cameras_for_files(intrinsics, size, from_pytorch3d(rotation, translation), paths, names, source, notes)
+    placed = cameras_for_files(intrinsics, size, from_pytorch3d(rotation, translation), paths, names, source, notes)
     mask_names = [(f.get("mask") or {}).get("path") for f in present]
-    masks = [inside(root, m, source) if m else None for m in mask_names]
-    masks = [m if m is not None and m.is_file() else None for m in masks]
-    scene_id = f"{category.name}_{sequence.name}"
-    return Capture(scene_id, "co3d", names, paths, cameras=cameras, masks=masks, missing=missing, notes=notes)
+    masks = [finder.find_all([m])[0] if m else None for m in mask_names]
+    lacking = [n for n, m in zip(mask_names, masks, strict=True) if m is None]
+    if len(lacking) == len(masks):
+        masks = []
+    elif lacking:
+        notes.append(f"{len(lacking)} of {len(masks)} frames have no mask and count whole.")
+    return Capture(
+        scene_id=f"{category.name}_{sequence.name}",
+        dataset="co3d",
+        names=names,
+        paths=paths,
+        cameras=placed.cameras,
+        upright=placed.upright,
+        masks=masks,
+        missing=missing,
+        notes=notes,
+    )
+
+
+def _ignored(frames: list[dict[str, Any]], category: Path) -> list[str]:
+    """One note on what the annotations have beside cameras, images and masks."""
+    unused = sorted({key for f in frames for key in f if f[key]} - READ_KEYS)
+    lists = sorted(p.name for p in (category / "set_lists").glob("*.json")) if (category / "set_lists").is_dir() else []
+    lists += [f.name for f in (category / "set_lists.json", category / "eval_batches") if f.exists()]
+    return [f"Of CO3D's annotations these are not used: {', '.join([*unused, *lists])}."] if unused or lists else []
 
 
 def _annotated_frames(source: Path, sequence: str) -> list[dict[str, Any]]:

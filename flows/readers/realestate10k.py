@@ -12,10 +12,10 @@ from pathlib import Path
 import torch
 
 from flows.errors import InputError
-from flows.media.images import image_size, list_images
+from flows.media.files import list_images
 from flows.readers import splits
 from flows.readers.base import Capture
-from flows.readers.parsing import cameras_for_files, from_camera_from_world, images_in, unlisted_note
+from flows.readers.parsing import cameras_for_files, files_size, from_camera_from_world, images_in, unlisted_note
 
 LOOKS_FOR = "a clip's .txt of 19 numbers a line below a video address, with frames named by timestamp (RealEstate10K)"
 COLUMNS = 19
@@ -45,20 +45,25 @@ def read(path: Path, image_folder: str | None, view_counts: tuple[int, ...]) -> 
     table = torch.tensor([listed[t] for t in times], dtype=torch.float64)
     paths = [files[t] for t in times]
     names = [p.name for p in paths]
-    size = torch.tensor([image_size(p) for p in paths], dtype=torch.float64)
+    size = files_size(paths).double()
     intrinsics = torch.eye(3, dtype=torch.float64).repeat(len(times), 1, 1)
     intrinsics[:, [0, 1], [0, 1]] = table[:, 1:3] * size
     intrinsics[:, :2, 2] = table[:, 3:5] * size
     camera_from_world = torch.eye(4, dtype=torch.float64).repeat(len(times), 1, 1)
     camera_from_world[:, :3] = table[:, 7:].reshape(-1, 3, 4)
     notes = [unlisted_note(len(missing), "listed frames without an image were", missing)] if missing else []
+    without = [p.name for p in list_images(folder) if p not in paths]
+    if without:
+        notes.append(unlisted_note(len(without), f"images of {folder.name} whose name is no listed time were", without))
     poses = from_camera_from_world(camera_from_world)
+    placed = cameras_for_files(intrinsics, size, poses, paths, names, source, notes)
     return Capture(
         scene_id=source.stem,
         dataset="realestate10k",
         names=names,
         paths=paths,
-        cameras=cameras_for_files(intrinsics, size, poses, paths, names, source, notes),
+        cameras=placed.cameras,
+        upright=placed.upright,
         splits=splits.every_8th(len(times), view_counts),
         missing=missing,
         notes=[*notes, splits.EVERY_8TH],
@@ -67,7 +72,7 @@ def read(path: Path, image_folder: str | None, view_counts: tuple[int, ...]) -> 
 
 def _rows(source: Path) -> list[list[float]]:
     rows = []
-    for number, line in enumerate(source.read_text(encoding="utf-8", errors="replace").splitlines()[1:], start=2):
+    for number, line in enumerate(source.read_text(encoding="utf-8-sig", errors="replace").splitlines()[1:], start=2):
         parts = line.split()
         try:
             values = [float(x) for x in parts]
@@ -98,7 +103,7 @@ def _camera_list(path: Path) -> Path | None:
     candidates = [path] if path.is_file() else sorted(path.glob("*.txt"))
     for candidate in candidates:
         if candidate.suffix == ".txt":
-            with candidate.open(encoding="utf-8", errors="replace") as stream:
+            with candidate.open(encoding="utf-8-sig", errors="replace") as stream:
                 head = [stream.readline(4096) for _ in range(2)]
             if head[0].startswith("http") and len(head[1].split()) == COLUMNS:
                 return candidate

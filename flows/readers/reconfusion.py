@@ -13,7 +13,8 @@ from flows.errors import InputError
 from flows.readers import splits
 from flows.readers.base import Capture
 from flows.readers.parsing import load_json, unlisted_note
-from flows.readers.transforms import load_frames, to_capture
+from flows.readers.transforms import to_capture
+from flows.readers.transforms_file import load_frames
 
 LOOKS_FOR = "transforms.json with train_test_split_3.json, _6 or _9 (ReconFusion, SEVA)"
 PATTERN = re.compile(r"train_test_split_(\d+)\.json")
@@ -28,9 +29,10 @@ def read(path: Path, image_folder: str | None, view_counts: tuple[int, ...]) -> 
     files = _split_files(path)
     if not files:
         raise InputError(f"{path} has no train_test_split_N.json; use the reader transforms for it.")
-    frames, missing = load_frames(path, "transforms.json", image_folder)
-    capture = to_capture(path, frames, missing)
-    total = len(frames) + len(missing)
+    listing = load_frames(path, "transforms.json", image_folder)
+    frames = listing.frames
+    capture = to_capture(path, listing)
+    total = len(frames) + len(listing.missing)
     view_of = {frame.json_id: view for view, frame in enumerate(frames)}
     for count, source in files.items():
         content = load_json(source)

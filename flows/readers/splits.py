@@ -23,9 +23,13 @@ def linspace_ids(ids: Sequence[int], count: int) -> list[int]:
 
 def held_out(count: int, test: Sequence[int], view_counts: Sequence[int]) -> Splits:
     """Splits with these test views, and a linspace over the other views for each count up to theirs."""
-    rest = [i for i in range(count) if i not in set(test)]
-    splits = {str(k): {"train": linspace_ids(rest, k), "test": list(test)} for k in view_counts if k <= len(rest)}
-    return splits | {"all": {"train": rest, "test": list(test)}}
+    return of_lists([i for i in range(count) if i not in set(test)], test, view_counts)
+
+
+def of_lists(train: Sequence[int], test: Sequence[int], view_counts: Sequence[int]) -> Splits:
+    """Splits with these test views and, for each count, a linspace over these training views."""
+    few = {str(k): {"train": linspace_ids(train, k), "test": list(test)} for k in view_counts if k <= len(train)}
+    return few | {"all": {"train": list(train), "test": list(test)}}
 
 
 def every_8th(count: int, view_counts: Sequence[int]) -> Splits:

@@ -30,23 +30,28 @@ def read(path: Path, image_folder: str | None, view_counts: tuple[int, ...]) -> 
     if folder is None:
         raise InputError(f"{path} has no *.camera files; it is not a Strecha scene.")
     images = images_in(path / (image_folder or ("images" if (path / "images").is_dir() else ".")), path)
-    by_stem = {p.name.removesuffix(".camera").split(".")[0]: p for p in folder.glob("*.camera")}
+    by_stem = {Path(p.name.removesuffix(".camera")).stem: p for p in folder.glob("*.camera")}
     paths = [p for p in images if p.stem in by_stem]
+    without = [p.name for p in images if p.stem not in by_stem]
     if not paths:
         raise InputError(f"No image of {path} has a camera file in {folder} (the file 0000.jpg has 0000.jpg.camera).")
     names = [p.name for p in paths]
     missing = sorted(by_stem.keys() - {p.stem for p in images})
     notes = [unlisted_note(len(missing), "cameras without an image were", missing)] if missing else []
+    if without:
+        notes.append(unlisted_note(len(without), "images without a camera file were", without))
     read_all = [_read_camera(by_stem[p.stem]) for p in paths]
     intrinsics, poses, size = (torch.stack(part) for part in zip(*read_all, strict=True))
     test = [i for i in TEST_VIEWS if i < len(paths)] if len(paths) >= 4 else []
     notes.append("Split rule: views 3 and 7 are test views; training views are a rounded linspace over the rest.")
+    placed = cameras_for_files(intrinsics, size, poses, paths, names, folder, notes)
     return Capture(
         scene_id=path.resolve().name,
         dataset="strecha",
         names=names,
         paths=paths,
-        cameras=cameras_for_files(intrinsics, size, poses, paths, names, folder, notes),
+        cameras=placed.cameras,
+        upright=placed.upright,
         splits=splits.held_out(len(paths), test, view_counts),
         missing=missing,
         notes=notes,

@@ -1,49 +1,28 @@
 """nerfstudio and instant-ngp: transforms.json; NeRF's synthetic scenes: transforms_train.json and _test.json.
 
-camera-to-world matrices with OpenGL camera axes; intrinsics global or per frame, in pixels of w x h or as
-camera_angle_x (radians); OpenCV distortion k1 k2 p1 p2 k3. nerfstudio writes the poses with `applied_transform` already
-applied; it is undone here, so that the world is that of the original reconstruction.
+camera-to-world matrices with OpenGL camera axes; intrinsics global or per frame, in pixels of w x h or as angles of
+view; OpenCV or fisheye distortion. nerfstudio writes the poses with `applied_transform` already applied; it is undone
+here, so that the world is that of the original reconstruction.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import Tensor
 
 from flows.errors import InputError
-from flows.media.images import EXTENSIONS, image_size
+from flows.media.files import image_size, list_images
 from flows.readers import splits
-from flows.readers.base import Capture, inside
-from flows.readers.parsing import (
-    cameras_for_files,
-    family_of,
-    from_opengl,
-    load_json,
-    numbers,
-    pinhole,
-    unlisted_note,
-)
+from flows.readers.base import Capture
+from flows.readers.lenses import stacked
+from flows.readers.matching import left_out
+from flows.readers.parsing import cameras_for_files, family_of, from_opengl, implied_size, unlisted_note
+from flows.readers.transforms_file import Listing, calibrated_size, lens, load_frames, pose, stored_size
 
 LOOKS_FOR = "transforms.json, or transforms_train.json (NeRF synthetic)"
 SYNTHETIC_PARTS = ("train", "val", "test")
-MODELS = frozenset({"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"})
-
-
-@dataclass
-class Frame:
-    """One frame of a transforms.json whose image exists. `json_id` is its place in the file's list."""
-
-    json_id: int
-    name: str
-    path: Path
-    entry: dict[str, Any]
-    header: dict[str, Any]
-    source: Path
+ROLES = ("train", "val", "test")
 
 
 def detect(path: Path) -> bool:
@@ -51,12 +30,12 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, image_folder: str | None, view_counts: tuple[int, ...]) -> Capture:
-    """Frames in sorted order of file_path; those without an image are reported and left out."""
-    if (path / "transforms.json").is_file():
-        frames, missing = load_frames(path, "transforms.json", image_folder)
-        capture = to_capture(path, frames, missing)
-        capture.splits = splits.every_8th(len(frames), view_counts)
-        capture.notes.append(splits.EVERY_8TH)
+    """Frames in sorted order of file_path; those without an image are reported and left out. `path` may be the file."""
+    folder, file_name = (path.parent, path.name) if path.is_file() else (path, "transforms.json")
+    if (folder / file_name).is_file():
+        listing = load_frames(folder, file_name, image_folder)
+        capture = to_capture(folder, listing)
+        _split(capture, listing, view_counts)
         return capture
     parts = [p for p in SYNTHETIC_PARTS if (path / f"transforms_{p}.json").is_file()]
     if "train" not in parts:
@@ -64,151 +43,145 @@ def read(path: Path, image_folder: str | None, view_counts: tuple[int, ...]) -> 
     return _read_synthetic(path, parts, view_counts)
 
 
-def load_frames(root: Path, file_name: str, image_folder: str | None = None) -> tuple[list[Frame], list[str]]:
-    """(frames whose image exists, sorted by name; names of the missing). InputError for a malformed file."""
-    source = root / file_name
-    header = load_json(source)
-    entries = header.get("frames") if isinstance(header, dict) else None
-    if not isinstance(entries, list) or not entries:
-        raise InputError(f'{source} has no list "frames"; it is not a transforms.json, or has no views.')
-    frames, missing = [], []
-    for i, entry in enumerate(entries):
-        if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
-            raise InputError(f'{source}: frame {i} has no "file_path".')
-        name = str(Path(entry["file_path"]))
-        if image_folder:
-            name = str(Path(image_folder) / Path(name).name)
-        found = _image_file(root, name, source)
-        if found is None:
-            missing.append(name)
-        else:
-            frames.append(Frame(i, name, found, entry, header, source))
-    if not frames:
-        raise InputError(
-            f"{source} lists {len(entries)} frames, but none of their images exists (first: {missing[0]})."
-        )
-    return sorted(frames, key=lambda f: f.name), missing
-
-
-def to_capture(path: Path, frames: list[Frame], missing: list[str]) -> Capture:
-    """Cameras and distortion of the frames, without splits."""
-    notes = [unlisted_note(len(missing), "frames whose image is missing were", missing)] if missing else []
-    names = [f.name for f in frames]
-    poses = torch.stack([_pose(f) for f in frames])
-    sizes = torch.stack([_calibrated_size(f) for f in frames])
-    intrinsics = torch.stack([_intrinsics(f, size) for f, size in zip(frames, sizes, strict=True)])
-    distortion = torch.stack([_distortion(f) for f in frames])
-    source = frames[0].source
+def to_capture(path: Path, listing: Listing) -> Capture:
+    """Cameras, lenses and masks of the frames, without splits."""
+    frames, notes, source = listing.frames, list(listing.notes), listing.frames[0].source
+    names, paths = [f.name for f in frames], [f.path for f in frames]
+    if listing.missing:
+        notes.append(unlisted_note(len(listing.missing), "frames whose image is missing were", listing.missing))
+    notes += _unlisted(path, listing)
+    said = [calibrated_size(f) for f in frames]
+    sizes = [size or stored_size(f, listing) for f, size in zip(frames, said, strict=True)]
+    lenses = [lens(f, size) for f, size in zip(frames, sizes, strict=True)]
+    intrinsics, distortion, fisheye = stacked(lenses)
+    calibrated = torch.tensor(sizes, dtype=torch.float64)
+    silent = [i for i, size in enumerate(said) if size is None]
+    if silent:
+        others = _other_sizes(path, frames[silent[0]].path.name)
+        calibrated[silent] = implied_size(intrinsics[silent], calibrated[silent], others, source, notes)
+    placed = cameras_for_files(
+        intrinsics, calibrated, from_opengl(torch.stack([pose(f) for f in frames])), paths, names, source, notes
+    )
+    masks = _masks(listing, notes)
     return Capture(
         scene_id=path.resolve().name,
         dataset=family_of(path),
         names=names,
-        paths=[f.path for f in frames],
-        cameras=cameras_for_files(
-            intrinsics, sizes, from_opengl(poses), [f.path for f in frames], names, source, notes
-        ),
-        distortion=distortion if distortion.any() else None,
-        missing=missing,
+        paths=paths,
+        cameras=placed.cameras,
+        upright=placed.upright,
+        distortion=distortion,
+        fisheye=fisheye,
+        masks=masks,
+        mask_training=bool(masks),
+        missing=listing.missing,
         notes=notes,
     )
 
 
+def _masks(listing: Listing, notes: list[str]) -> list[Path | None]:
+    """The frames' mask_path: pixels that are black there are neither trained on nor measured."""
+    named = [f.entry.get("mask_path") for f in listing.frames]
+    if not any(named):
+        return []
+    found = [listing.finder.find_all([m])[0] if m else None for m in named]
+    lacking = [f.name for f, mask in zip(listing.frames, found, strict=True) if mask is None]
+    if len(lacking) == len(found):
+        raise InputError(
+            f"{listing.frames[0].source} names masks, but none of them exists (first: {next(m for m in named if m)}); "
+            "put them there, or remove mask_path."
+        )
+    notes.append("Masks are those of mask_path: black pixels are not trained on.")
+    if lacking:
+        notes.append(f"{len(lacking)} frames have no mask and count whole: {', '.join(lacking[:12])}.")
+    return found
+
+
+def _split(capture: Capture, listing: Listing, view_counts: tuple[int, ...]) -> None:
+    """The file's own lists of training and held-out views, else every 8th."""
+    lists = {r: listing.header[f"{r}_filenames"] for r in ROLES if listing.header.get(f"{r}_filenames") is not None}
+    source = listing.frames[0].source
+    if not lists:
+        capture.splits = splits.every_8th(len(capture), view_counts)
+        capture.notes.append(splits.EVERY_8TH)
+        return
+    views: dict[str, list[int]] = {}
+    for role, names in lists.items():
+        if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
+            raise InputError(f'{source}: "{role}_filenames" is not a list of file names.')
+        views[role], unknown = listing.views(names)
+        if unknown:
+            left = f"names of {role}_filenames that are no frame with an image were"
+            capture.notes.append(unlisted_note(len(unknown), left, unknown))
+    test_role = "test" if views.get("test") else "val"
+    test = views.get(test_role, [])
+    held_out = {i for role in ("val", "test") for i in views.get(role, [])}
+    train = views.get("train", [i for i in range(len(capture)) if i not in held_out])
+    both = sorted(set(train) & set(test))
+    if both:
+        raise InputError(
+            f"{source} lists {capture.names[both[0]]} in train_filenames and in {test_role}_filenames; choose one."
+        )
+    capture.splits = splits.of_lists(train, test, view_counts)
+    used = f"{test_role}_filenames" if test else "none, as no held-out view is listed"
+    capture.notes.append(
+        f"Split: training views are those of {'train_filenames' if 'train' in views else 'no list of held-out views'}, "
+        f"test views those of {used}; few-view splits are a rounded linspace over the training views."
+    )
+    idle = [capture.names[i] for i in range(len(capture)) if i not in set(train) | set(test)]
+    if idle:
+        capture.notes.append(unlisted_note(len(idle), "views in no list of the split in use were", idle))
+
+
 def _read_synthetic(path: Path, parts: list[str], view_counts: tuple[int, ...]) -> Capture:
-    frames, missing, roles = [], [], []
+    listings, roles = [], []
     for part in parts:
         try:
-            found, lost = load_frames(path, f"transforms_{part}.json")
+            found = load_frames(path, f"transforms_{part}.json")
         except InputError as error:
             if part == "train" or "none of their images" not in str(error):
                 raise
             continue
-        found.sort(key=lambda f: f.json_id)  # r_0, r_1, ... r_10: the file's order is the numbers' order
-        frames += found
-        missing += lost
-        roles += [part] * len(found)
-    capture = to_capture(path, frames, missing)
+        found.frames.sort(key=lambda f: f.json_id)  # r_0, r_1, ... r_10: the file's order is the numbers' order
+        listings.append(found)
+        roles += [part] * len(found.frames)
+    first = listings[0]
+    frames = [f for listing in listings for f in listing.frames]
+    missing = [m for listing in listings for m in listing.missing]
+    notes = list(dict.fromkeys(n for listing in listings for n in listing.notes))
+    capture = to_capture(path, Listing(frames, missing, first.finder, None, first.header, notes))
     capture.dataset = "nerf_synthetic"
     train = [i for i, role in enumerate(roles) if role == "train"]
     test = [i for i, role in enumerate(roles) if role == "test"]
-    few = {str(k): splits.linspace_ids(train, k) for k in view_counts if k <= len(train)}
-    capture.splits = {name: {"train": ids, "test": test} for name, ids in (few | {"all": train}).items()}
+    capture.splits = splits.of_lists(train, test, view_counts)
     capture.notes.append(
         "Split rule: test views are those of transforms_test.json, training views a rounded linspace over the others."
     )
     return capture
 
 
-def _image_file(root: Path, name: str, source: Path) -> Path | None:
-    """The file itself, or with an extension added where the JSON leaves it out (NeRF synthetic)."""
-    target = inside(root, name, source)
-    if target.is_file():
-        return target
-    candidates = (target.with_name(f"{target.name}.{e}") for e in ("png", "jpg", *sorted(EXTENSIONS)))
-    return next((inside(root, str(c.relative_to(root)), source) for c in candidates if c.is_file()), None)
+def _unlisted(path: Path, listing: Listing) -> list[str]:
+    """A note about photos beside the listed ones that no frame names."""
+    parents = {f.path.parent for f in listing.frames}
+    folder = next(iter(parents))
+    if len(parents) > 1 or folder == path:
+        return []
+    names = [n for n in left_out(folder, [f.path for f in listing.frames], path) if "/" not in n]
+    masks = {str(f.entry.get("mask_path", "")).replace("\\", "/").split("/")[-1] for f in listing.frames}
+    names = [n for n in names if n not in masks and "depth" not in n and "normal" not in n]
+    return (
+        [unlisted_note(len(names), f"photos of the folder {folder.name} that no frame names were", names)]
+        if names
+        else []
+    )
 
 
-def _value(frame: Frame, key: str) -> float | None:
-    """A number of the frame, else of the file's header."""
-    value = frame.entry.get(key, frame.header.get(key))
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(f'{frame.source}: "{key}" of {frame.name} is {value!r}; expected a number.')
-    return float(value)
-
-
-def _pose(frame: Frame) -> Tensor:
-    """(4, 4) camera-to-world, OpenGL axes, with applied_transform undone."""
-    if "transform_matrix" not in frame.entry:
-        raise InputError(f'{frame.source}: frame {frame.name} has no "transform_matrix".')
-    matrix = _as_4x4(frame.entry["transform_matrix"], f"transform_matrix of {frame.name}", frame.source)
-    if "applied_transform" in frame.header:
-        applied = _as_4x4(frame.header["applied_transform"], "applied_transform", frame.source)
-        if not applied.isfinite().all() or abs(float(torch.linalg.det(applied))) < 1e-12:
-            raise InputError(f"{frame.source}: applied_transform cannot be inverted; remove it or correct it.")
-        matrix = torch.linalg.solve(applied, matrix)
-    return matrix
-
-
-def _as_4x4(rows: Any, what: str, source: Path) -> Tensor:
-    short = isinstance(rows, list) and len(rows) == 3
-    matrix = numbers(rows, (3, 4) if short else (4, 4), what, source)
-    return torch.cat([matrix, torch.tensor([[0.0, 0, 0, 1]], dtype=torch.float64)]) if short else matrix
-
-
-def _calibrated_size(frame: Frame) -> Tensor:
-    """(2,) the w x h that the intrinsics are for; the image file's own size where the JSON doesn't say."""
-    width, height = _value(frame, "w"), _value(frame, "h")
-    size = image_size(frame.path) if width is None or height is None else (width, height)
-    return torch.tensor(size, dtype=torch.float64)
-
-
-def _intrinsics(frame: Frame, size: Tensor) -> Tensor:
-    width, height = size.tolist()
-    fx, fy = _value(frame, "fl_x"), _value(frame, "fl_y")
-    angle_x, angle_y = _value(frame, "camera_angle_x"), _value(frame, "camera_angle_y")
-    if fx is None and angle_x is not None:
-        if not 0 < angle_x < math.pi:
-            raise InputError(f"{frame.source}: camera_angle_x is {angle_x:g}; expected radians between 0 and pi.")
-        fx = width / (2 * math.tan(angle_x / 2))
-    if fy is None:
-        fy = height / (2 * math.tan(angle_y / 2)) if angle_y is not None and _value(frame, "fl_x") is None else fx
-    if fx is None or fy is None:
-        raise InputError(
-            f"{frame.source}: frame {frame.name} has neither fl_x nor camera_angle_x; add the focal length."
-        )
-    cx, cy = _value(frame, "cx"), _value(frame, "cy")
-    return pinhole(fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
-
-
-def _distortion(frame: Frame) -> Tensor:
-    """(5,) k1, k2, p1, p2, k3."""
-    model = frame.entry.get("camera_model", frame.header.get("camera_model", "OPENCV"))
-    fisheye = frame.entry.get("is_fisheye", frame.header.get("is_fisheye", False))
-    if fisheye or str(model).upper() not in MODELS or _value(frame, "k4"):
-        what = "a fisheye lens" if fisheye else f'the camera model "{model}"' if not _value(frame, "k4") else "k4"
-        raise InputError(
-            f"{frame.source}: {frame.name} has {what}, which is not supported; "
-            f"undistort the images first, or use one of {', '.join(sorted(MODELS))}."
-        )
-    return torch.tensor([_value(frame, k) or 0.0 for k in ("k1", "k2", "p1", "p2", "k3")], dtype=torch.float64)
+def _other_sizes(path: Path, name: str) -> list[tuple[float, float]]:
+    """Sizes of the photo, or of the first one, in the scene's other image folders, the largest first."""
+    sizes = []
+    for folder in sorted(p for p in path.iterdir() if p.is_dir() and p.resolve().is_relative_to(path.resolve())):
+        files = list_images(folder)
+        file = next((f for f in files if f.stem == Path(name).stem), files[0] if files else None)
+        if file is not None and "mask" not in folder.name:
+            sizes.append(tuple(map(float, image_size(file, upright=False))))
+    return sorted(set(sizes), reverse=True)  # type: ignore[arg-type]

@@ -34,7 +34,7 @@ def open_reconstructor(job: Job) -> Reconstructor:
     """One for the job, with its settings; nothing of the scene is read. Raises ConfigError naming a bad setting."""
     settings = job.config.reconstruct
     request = ReconstructionRequest(
-        settings.preset, settings.overrides, job.dataset, job.generates, job.config.skip.model_dump(), job.hinted
+        settings.preset, settings.overrides, job.dataset, job.generates, job.config.skip.model_dump()
     )
     try:
         return reconstructor_class(settings.method).from_request(request)

@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 
 from cat3d_core.reconstruction import Reconstructor
 from flows.errors import InputError
-from flows.jobs.device import device
+from flows.jobs.device import exact_device
 from flows.jobs.job import Job
 from flows.reconstruction.open import reconstructor_class
 from schemas.errors import ConfigError
@@ -51,7 +51,7 @@ def read_reconstruction(store: SceneStore, run: Run) -> Reconstructor:
     method, settings = attrs.get("method", "zipnerf"), attrs.get("settings", record.inputs)
     tensors = {name: torch.from_numpy(section.read(name)) for name in attrs["parameters"]}
     try:
-        return reconstructor_class(method).from_tensors(settings, tensors, device())
+        return reconstructor_class(method).from_tensors(settings, tensors, exact_device())
     except ConfigError as error:
         raise InputError(f"The field of {run.name} in {store.folder} cannot be read: {error}") from None
     except (KeyError, TypeError, ValueError) as error:

@@ -101,7 +101,7 @@ def gallery(scenes: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]) ->
         name = best.get(scene["id"])
         shown = {run["name"] for run in scene["runs"] if run["views"]}
         if name is not None and name in shown:
-            rival = beside.get((scene["id"], name))
+            rival: str | None = beside.get((str(scene["id"]), str(name)))
             out.append({"scene": scene["id"], "run": name, "rival": rival if rival in shown else None})
     return out
 
@@ -128,6 +128,7 @@ def scene_section(out: Path, path: Path) -> dict[str, Any]:
                 "decisions": {stage: record.decisions for stage, record in records.items() if record.decisions},
                 "codes": {stage: record.code_version for stage, record in records.items()},
                 "model": records["sample"].inputs.get("model", "") if "sample" in records else "",
+                "terms": run.generated.attrs.get("terms", "") if "generated" in run else "",
                 "config": run.attrs.get("job", {}).get("config", {}),
                 "plan": _uri((folder / "plan.png").read_bytes()) if (folder / "plan.png").exists() else None,
                 "video": f"{store.scene_id}/{name}/path.mp4" if (folder / "path.mp4").exists() else None,

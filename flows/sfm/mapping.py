@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from flows.media.images import exif_focal_px, read_image, read_mask, resize, write_png
+from flows.media.files import exif_focal_px
+from flows.media.images import read_image, read_mask, resize, write_png
 from flows.sfm.colmap import pycolmap
 
 Progress = Callable[[str, int, int], None]

@@ -19,8 +19,9 @@ from torch import Tensor
 
 from cat3d_core.cameras import Cameras
 from flows.errors import InputError
-from flows.media.images import exif_focal_px, read_image
-from flows.readers.colmap import camera_from_world, intrinsics_of
+from flows.media.files import exif_focal_px
+from flows.media.images import read_image
+from flows.readers.lenses import lens_of
 from flows.readers.parsing import from_camera_from_world, pinhole
 from flows.sfm.colmap import pycolmap
 from flows.sfm.mapping import FROM_EXIF, Attempt, Mapper, PoseSettings, Progress, image_index
@@ -115,11 +116,12 @@ def _best_result(attempts: list[Attempt], job: Mapper, names: list[str]) -> Pose
     by_index = {image_index(im.name): im for im in best.images.values() if im.has_pose}
     intrinsics, distortion = [], []
     for i in placed:
-        k, d = intrinsics_of(best.cameras[by_index[i].camera_id], f"the estimate for {names[i]}")
-        k[:2] /= torch.tensor(job.scales[i], dtype=torch.float64)[:, None]
-        intrinsics.append(k)
-        distortion.append(d)
-    poses = from_camera_from_world(torch.stack([camera_from_world(by_index[i]) for i in placed]))
+        camera = best.cameras[by_index[i].camera_id]
+        lens = lens_of(camera.model.name, camera.params.tolist(), f"the estimate for {names[i]}")
+        lens.intrinsics[:2] /= torch.tensor(job.scales[i], dtype=torch.float64)[:, None]
+        intrinsics.append(lens.intrinsics)
+        distortion.append(lens.distortion[:5])
+    poses = from_camera_from_world(torch.stack([_camera_from_world(by_index[i]) for i in placed]))
     bent = torch.stack(distortion)
     points = torch.as_tensor(np.array([p.xyz for p in best.points3D.values()]).reshape(-1, 3))
     report = PoseReport(
@@ -136,6 +138,13 @@ def _best_result(attempts: list[Attempt], job: Mapper, names: list[str]) -> Pose
     )
     cameras = Cameras(torch.stack(intrinsics), poses, torch.tensor([job.sizes[i] for i in placed]))
     return PosesResult(cameras, bent if bent.any() else None, placed, points, report)
+
+
+def _camera_from_world(image: pycolmap.Image) -> Tensor:
+    """(4, 4) float64, OpenCV axes."""
+    out = torch.eye(4, dtype=torch.float64)
+    out[:3] = torch.as_tensor(np.array(image.cam_from_world().matrix()))
+    return out
 
 
 def _too_few(placed: list[int], names: list[str], needed: int) -> str:

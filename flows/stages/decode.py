@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from flows.errors import InputError
 from flows.generation.groups import view_keys
 from flows.generation.hints import explained_views
+from flows.generation.imported import Imported, imported
 from flows.generation.open import generator_spec, open_generator
 from flows.generation.views import finished
 from flows.jobs.job import Job, Outcome
@@ -16,18 +18,23 @@ from flows.jobs.stage import Stage, generates
 from flows.media.images import to_uint8
 from flows.workers.fan_out import fan_out
 from flows.workers.work import Work, is_done
-from schemas.decisions import skipped
+from schemas.decisions import chosen, skipped
 from schemas.scene_store import SceneStore
 
 
 def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
-    """The generator, and whether its views are put together with what photos show."""
+    """The generator, and whether its views are put together with what photos show; or the pictures that were imported
+    instead, with the plan that they are of."""
+    if found := imported(job):
+        return {"imported": found.sha256, "plan key": keys["plan"]}
     return {"model": generator_spec(job).identity} | ({"hints": True} if job.hinted else {})
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     """Write `generated/image`, each view recorded in `done_image` when it is complete; only missing ones are made, and
-    none of those that were left out of the sampling."""
+    none of those that were left out of the sampling. Imported ones are there already."""
+    if found := imported(job):
+        return take_over(job, store, key, found)
     generated = store.run(job.run).generated
     views, (width, height) = generated.shape("latent")[0], generator_spec(job).image_size
     generated.create_array("image", (views, height, width, 3))
@@ -57,7 +64,25 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     missing = len(share.passes[0])
     label = f"decode {job.scene_id} {job.run}"
     totals = fan_out([share], job.config.execution, label, here=job.config.skip.workers)
-    return Outcome({"views": missing, "evaluations": missing} | totals.work(), decisions + totals.decisions)
+    counts = {"views": missing, "evaluations": missing} | totals.work()
+    return Outcome(counts, decisions + totals.decisions, totals.usage)
+
+
+def take_over(job: Job, store: SceneStore, key: str, found: Imported) -> Outcome:
+    """Imported views become the run's generated ones. Raises InputError where they are of another plan."""
+    run, plan = store.run(job.run), store.record("plan", job.run)
+    if plan is None or plan.key != found.plan:
+        raise InputError(
+            f"The plan of {job.run} has changed since views were imported for it from {found.folder}: make them again "
+            "(`cat3d export --what plan`, `cat3d import-views`), or generate them here (`cat3d import-views --forget`)."
+        )
+    count = run.generated.shape("image")[0]
+    keys = view_keys(key, count)
+    run.generated.remove("confidence")  # of views that were generated here before
+    run.generated.create_array("done_image", (count, 32))
+    run.generated.mark_done("done_image", [keys[view] for view in found.views], found.views)
+    run.generated.mark_skipped("done_image", sorted(set(range(count)) - set(found.views)))
+    return Outcome({"views": len(found.views)}, [chosen(str(found))])
 
 
 def work(job: Job, store: SceneStore, key: str, items: Sequence[int]) -> None:

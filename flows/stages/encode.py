@@ -9,11 +9,12 @@ import numpy as np
 
 from cat3d_core.sample_sets import KINDS
 from flows.generation.groups import CAPTURED_LATENTS
+from flows.generation.imported import samples
 from flows.generation.open import forget_generator, generator_spec, open_generator
 from flows.generation.views import captured_sample
 from flows.jobs.device import cpu_threads
 from flows.jobs.job import Job, Outcome
-from flows.jobs.stage import Stage, generates
+from flows.jobs.stage import Stage
 from flows.progress import Meter, meter
 from schemas.content_key import content_key
 from schemas.scene_store import SceneStore
@@ -56,4 +57,4 @@ def encode_views(job: Job, store: SceneStore, key: str, kind: str, views: list[i
     return len(missing)
 
 
-STAGE = Stage("encode", execute, version=1, reads=("poses",), inputs=inputs, wanted=generates, passing=True)
+STAGE = Stage("encode", execute, version=1, reads=("poses",), inputs=inputs, wanted=samples, passing=True)

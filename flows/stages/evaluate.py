@@ -10,16 +10,18 @@ import torch
 from torch import Tensor
 
 from cat3d_core.metrics import measures
+from cat3d_core.metrics.clip import find_clip
 from cat3d_core.metrics.measures import PERCEPTUAL, Comparison, Network
 from cat3d_core.metrics.protocols import PROTOCOLS
-from flows.jobs.access import read_cameras, read_similarity, views_with_role
+from flows.jobs.access import read_cameras, read_images, read_similarity, views_with_role
 from flows.jobs.job import Job, Outcome
 from flows.jobs.metric_table import metric_table
 from flows.jobs.stage import Stage, settings_of
+from flows.media.clip_text import text_embedding
 from flows.progress import meter
 from flows.stages import render
 from schemas.content_key import content_key
-from schemas.decisions import skipped, warning
+from schemas.decisions import Decision, chosen, skipped, warning
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
 from schemas.tables import append_rows
@@ -36,6 +38,8 @@ def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
     found: dict[str, Any] = {
         "render key": content_key(field=keys["reconstruct"], test=test, version=str(render.VERSION))
     }
+    if job.capture().made_from is not None:
+        found["path key"] = keys["render"]
     found |= {n.key: n.name() if _wanted(job, n) else None for n in measures.networks(measures.METRICS)}
     added = [metric.name for metric in measures.METRICS if metric.name not in MEASURED]
     return found | ({"metrics": added} if added else {})
@@ -71,8 +75,28 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
                 progress.advance()
     else:
         decisions.append(skipped("This run has no rendered held-out views: there is nothing to compare."))
+    decisions += text_scores(job, store)
     append_rows(job.results_path / "metrics", metric_table(), rows, f"{job.scene_id}.{job.run}")
     return Outcome({"views": len(test)}, decisions)
+
+
+def text_scores(job: Job, store: SceneStore) -> list[Decision]:
+    """Of a scene that a text made: how well the video's frames agree with the text and with its photo by CLIP, where
+    there are weights for it."""
+    run, made_from = store.run(job.run), store.captured.attrs.get("made_from")
+    if not made_from or "path" not in run.section("renders"):
+        return []
+    if (tower := find_clip()) is None:
+        return [warning("No CLIP weights (CAT3D_CLIP_WEIGHTS names a file of them): no scores of text and photo.")]
+    frames = read_images(run.renders("path"), range(run.renders("path").shape("size")[0]))
+    photo = store.captured.read_image("image", 0)
+    embedded = torch.cat([tower(_image(np.asarray(frame))[None]) for frame in frames])
+    by_photo = float((embedded @ tower(_image(photo)[None])[0]).mean())
+    said = f"{len(frames)} frames of the video by {tower.name}: CLIP score {by_photo:.3f} with the photo"
+    text = text_embedding(made_from["text"])
+    if text is None:
+        return [chosen(f"{said}; none with the text (its tower and tokenizer, or transformers, are missing).")]
+    return [chosen(f"{said}, {float((embedded @ text).mean()):.3f} with the text.")]
 
 
 def _wanted(job: Job, network: Network) -> bool:

@@ -15,8 +15,9 @@ from flows.errors import InputError
 from flows.jobs.job import Job, Outcome
 from flows.jobs.stage import Stage, settings_of
 from flows.media import images
-from flows.progress import meter
+from flows.progress import console, meter
 from flows.readers.base import Capture
+from flows.sfm.consistency import check_consistency
 from schemas.config import IngestConfig
 from schemas.decisions import chosen, warning
 from schemas.scene_store import SceneStore
@@ -49,10 +50,14 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
             return out
 
         views = list(pool.map(one, range(count)))
+    store.captured.set_attrs(made_from=capture.made_from)
     write_captured(store, capture, job.scene.digests["images"], views)
     decisions = [warning(note) for note in capture.notes]
-    if capture.distortion is not None and capture.distortion.any():
+    if capture.distortion is not None:
         decisions.append(chosen("The images were undistorted; the stored intrinsics are those of the pinhole images."))
+    if capture.paths and job.config.ingest.check_cameras:
+        with console.status(f"Checking the cameras of {job.scene_id}"):
+            decisions += [warning(text) for text in check_consistency(capture)]
     pixels = sum(v.image.shape[0] * v.image.shape[1] for v in views)
     return Outcome({"views": count, "pixels": pixels}, decisions)
 
@@ -68,6 +73,7 @@ def write_captured(store: SceneStore, capture: Capture, digests: dict[str, str],
     captured.create_array("image", (len(views), height, width, 3))
     captured.write_images("image", [v.image for v in views], range(len(views)))
     masks = [v.mask for v in views]
+    captured.set_attrs(title=capture.title, mask_training=capture.mask_training)
     if any(m is not None for m in masks):
         captured.create_array("mask", (len(views), height, width))
         full = [np.full(v.image.shape[:2], 255, np.uint8) if v.mask is None else v.mask for v in views]
@@ -96,28 +102,35 @@ def ingest_view(
     if capture.images is not None:
         image, alpha = capture.images[view], None
     else:
-        image, alpha = images.read_image(capture.paths[view], max_pixels=settings.max_pixels)
+        image, alpha = images.read_image(capture.paths[view], max_pixels=settings.max_pixels, upright=capture.upright)
     mask = alpha
     mask_path = capture.masks[view] if capture.masks else None
     if mask_path is not None:
-        mask = images.read_mask(mask_path)
+        mask = images.read_mask(mask_path, upright=capture.upright)
+        if capture.mask_training and not mask.any():
+            raise InputError(
+                f"The mask {mask_path} of {capture.names[view]} is black everywhere, which leaves no pixel to train "
+                "on; mend the mask (white is what counts), or leave the view out."
+            )
         if mask.shape != image.shape[:2]:
             mask = images.resize(mask, image.shape[1], image.shape[0])
     height, width = image.shape[:2]
     if camera is None and capture.cameras is not None:
         camera = capture.cameras[view]
+    fisheye = False
     if distortion is None and capture.distortion is not None:
         distortion = capture.distortion[view]
+        fisheye = capture.fisheye is not None and bool(capture.fisheye[view])
     if camera is not None and camera.size[0].tolist() != [width, height]:
         raise InputError(
             f"Image {capture.names[view]} is {width} x {height} pixels, but its camera is for "
             f"{camera.size[0, 0]} x {camera.size[0, 1]}; give the image the camera belongs to."
         )
-    if camera is not None and distortion is not None and distortion.any():
+    if camera is not None and distortion is not None and (fisheye or distortion.any()):
         original = camera.intrinsics[0]
-        image, intrinsics = images.undistort(image, original, distortion)
+        image, intrinsics = images.undistort(image, original, distortion, fisheye=fisheye)
         if mask is not None:
-            mask, _ = images.undistort(mask, original, distortion, nearest=True)
+            mask, _ = images.undistort(mask, original, distortion, nearest=True, fisheye=fisheye)
         camera = Cameras(intrinsics[None], camera.world_from_camera, camera.size)
     small_width, small_height = (max(1, round(side / settings.downscale)) for side in (width, height))
     image = images.resize(image, small_width, small_height)
@@ -127,4 +140,6 @@ def ingest_view(
     return Ingested(image, mask, small)
 
 
-STAGE = Stage("ingest", execute, version=1, settings=settings_of("ingest"), inputs=inputs)
+# The digests of a video's frames cover which those are, and the check only warns.
+SETTINGS = settings_of("ingest", without=("frames", "check_cameras"))
+STAGE = Stage("ingest", execute, version=1, settings=SETTINGS, inputs=inputs)

@@ -14,7 +14,7 @@ from flows.generation.plan import write_plan
 from flows.jobs.access import read_cameras, views_with_role
 from flows.jobs.job import Job, Outcome
 from flows.jobs.stage import Stage, generates, settings_of
-from schemas.decisions import chosen
+from schemas.decisions import chosen, skipped
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
 
@@ -26,9 +26,10 @@ def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
     """The training views, what the generator wants (the side of its images in pixels, the views of a group), and what
     may be skipped."""
     spec, skip = generator_spec(job), job.config.skip
-    return {
+    layout = {} if spec.layout == "groups" else {"layout": spec.layout}
+    return layout | {
         "train": job.view_names("train"),
-        "image_size": spec.image_size[0],
+        "image_size": planned_size(job),
         "views": spec.views,
         "drop_by_coverage": skip.coverage,
         "covered_share": COVERED_SHARE if skip.covered_path else None,
@@ -52,6 +53,12 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     summary = f"{len(plan)} views of the trajectory {plan.recipe} in {len(plan.groups)} groups"
     decisions = [chosen(f"{summary}, {anchors} of them anchors." if anchors else f"{summary}.")]
     decisions += map(chosen, plan.reasons)
+    if plan.dropped:
+        text = "Views that add nothing to the coverage of the scene are not generated."
+        decisions.append(skipped(text, "coverage", views=plan.dropped))
+    if not plan.needed:
+        text = "No view is generated: captured views show what they would from nearly the same directions."
+        decisions.append(skipped(text, "covered_path", views=len(plan)))
     return Outcome({"views": len(plan), "groups": len(plan.groups)}, decisions)
 
 
@@ -68,9 +75,21 @@ def planned(job: Job, store: SceneStore, train: list[int]) -> Plan:
         raise ConfigError(f"The settings of the plan don't work for {job.scene_id}: {error}") from None
 
 
+def planned_size(job: Job) -> int:
+    """Side of the planned views in pixels: the generator's, unless another was asked for."""
+    return job.config.plan.image_size or generator_spec(job).image_size[0]
+
+
 def core_config(job: Job, captured: Cameras) -> PlanConfig:
     """The core's settings for the run's; conditioning views and targets together are what the generator takes."""
     settings, spec, skip = job.config.plan, generator_spec(job), job.config.skip
+    if spec.layout == "windows":
+        for name in ("anchors", "condition_views", "group_size"):
+            if getattr(settings, name) is not None:
+                raise ConfigError(
+                    f"plan.{name} is set, but this generator's windows of {spec.views} views follow from "
+                    "the number of photos and of views: leave it out."
+                )
     conditions = settings.condition_views or max((n for n in spec.given if n <= 3), default=min(spec.given))
     if conditions not in spec.given:
         raise ConfigError(
@@ -95,9 +114,10 @@ def core_config(job: Job, captured: Cameras) -> PlanConfig:
         group_size=settings.group_size,
         keep_captured=settings.always_captured,
         samples="both" if settings.wide and not_square else "square",
-        image_size=spec.image_size[0],
+        image_size=planned_size(job),
         drop_by_coverage=skip.coverage,
         covered_share=COVERED_SHARE if skip.covered_path else None,
+        layout=spec.layout,
     )
 
 
@@ -106,5 +126,11 @@ def _points(store: SceneStore) -> torch.Tensor | None:
 
 
 STAGE = Stage(
-    "plan", execute, version=1, reads=("poses",), settings=settings_of("plan", "seed"), inputs=inputs, wanted=generates
+    "plan",
+    execute,
+    version=1,
+    reads=("poses",),
+    settings=settings_of("plan", "seed", without=("image_size",)),
+    inputs=inputs,
+    wanted=generates,
 )

@@ -15,7 +15,7 @@ from cat3d_core.normalization import Similarity, normalize_scene
 from flows.jobs.access import write_cameras
 from flows.jobs.job import Job, Outcome
 from flows.jobs.stage import Stage, settings_of
-from flows.media import images
+from flows.media.files import image_size
 from flows.progress import Meter, meter
 from flows.readers.base import Capture
 from flows.sfm.poses import PoseSettings, estimate_poses
@@ -33,7 +33,17 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     """Write `world_from_camera` (scene frame), `registered`, points and depth bounds, and the similarity."""
     capture = job.capture()
     if job.config.poses.estimate == "always":
-        capture = dataclasses.replace(capture, cameras=None, distortion=None, points=None, depth_bounds=None)
+        masks = capture.masks if capture.upright else []  # they belong to the pixels as stored, the estimate does not
+        capture = dataclasses.replace(
+            capture,
+            cameras=None,
+            distortion=None,
+            fisheye=None,
+            points=None,
+            depth_bounds=None,
+            upright=True,
+            masks=masks,
+        )
     if capture.cameras is not None:
         decisions = [skipped("Skipped pose estimation: the cameras are given.")]
         cameras = _stored_cameras(store, capture.cameras)
@@ -84,7 +94,7 @@ def _estimate(
             if capture.images is not None:
                 height, width = capture.images[view].shape[:2]
             else:
-                width, height = images.image_size(capture.paths[view])
+                width, height = image_size(capture.paths[view], upright=capture.upright)
             camera = camera.resize(width, height)
         views.append(ingest_view(capture, view, job.config.ingest, lens, camera))
     write_captured(store, capture, job.scene.digests["images"], views)

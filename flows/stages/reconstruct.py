@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from cat3d_core.reconstruction import Reconstructor
-from flows.jobs.device import device
+from flows.jobs.device import exact_device
 from flows.jobs.job import Job, Outcome
 from flows.jobs.stage import Stage, settings_of
 from flows.progress import meter
@@ -37,7 +37,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     run = store.run(job.run)
     reconstructor = open_reconstructor(job)
     views, decisions = training_views(job, store, run)
-    started = reconstructor.start(views, job.config.seed, device())
+    started = reconstructor.start(views, job.config.seed, exact_device())
     decisions += [Decision(**vars(decision)) for decision in started]
     checkpoint = Checkpoint(job, key)
     state = checkpoint.load()

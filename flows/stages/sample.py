@@ -14,11 +14,13 @@ from cat3d_core.plan import Group
 from flows.errors import WorkerError
 from flows.generation.groups import StoredPlan, view_keys
 from flows.generation.hints import explained_views
+from flows.generation.imported import samples
 from flows.generation.open import generator_spec, open_generator
+from flows.generation.opening import opening
 from flows.generation.rounds import OneRound, Rounds
 from flows.generation.sampling import sampler_config, sampler_settings
 from flows.jobs.job import Job, Outcome
-from flows.jobs.stage import Stage, generates, settings_of
+from flows.jobs.stage import Stage, settings_of
 from flows.workers.fan_out import Totals, fan_out
 from flows.workers.work import Work, is_done
 from schemas.decisions import Decision, chosen, skipped
@@ -39,7 +41,9 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
 
     Views that the scene doesn't need are recorded there as left out on purpose.
     """
+    opening(job)  # before workers are started in vain
     run = store.run(job.run)
+    run.generated.set_attrs(terms=generator_spec(job).terms)
     plan = StoredPlan(store, run, job.config.seed)
     explained = explained_views(run)
     rounds = Rounds(job, store, plan, sampling_flops(job, plan)) if job.config.skip.rounds else OneRound(plan)
@@ -75,7 +79,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     counts = {"views": sum(len(plan.groups[g].targets) for g in groups), "groups": len(groups)}
     spent = sum(group_cost(job, plan.groups[g], c).evaluations for g, c in zip(groups, configs, strict=True))
     counts |= {"steps": sum(c.steps for c in configs), "evaluations": spent}
-    return Outcome(counts | totals.work(), decisions)
+    return Outcome(counts | totals.work(), decisions, totals.usage)
 
 
 def sample_work(job: Job, store: SceneStore, key: str, passes: Sequence[Sequence[int]] | None = None) -> Work:
@@ -120,6 +124,11 @@ def sampler_decisions(job: Job, plan: StoredPlan, groups: Sequence[int]) -> list
     spared = group_cost(job, first, everywhere).evaluations - full
     how = f"guided by {scale:g} in {guided} of them" if guided else "without guidance"
     out = [chosen(f"{full} evaluations of the network a group: {config.steps} steps of {config.solver}, {how}.")]
+    whole = sampler_config(job, shortened=False)
+    shorter = group_cost(job, first, whole).evaluations - full
+    if shorter > 0:
+        text = f"{config.steps} steps of {config.solver} in place of {whole.steps} of {whole.solver}."
+        out.append(skipped(text, "solver", evaluations=shorter * len(groups)))
     if spared:
         text = f"Skipped the unconditional half in {spared} steps: guidance is on at log-SNR from "
         text += f"{config.guidance.low_log_snr:g} to {config.guidance.high_log_snr:g}."
@@ -162,5 +171,5 @@ STAGE = Stage(
     reads=("plan", "match", "encode"),
     settings=settings_of("sample", "seed", without=("generator", "checkpoint")),  # its identity is among the inputs
     inputs=inputs,
-    wanted=generates,
+    wanted=samples,
 )

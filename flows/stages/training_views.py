@@ -12,7 +12,7 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.reconstruction import Views
 from flows.generation.brief import LEAST, shown_by_captured
 from flows.generation.views import GeneratedView, generated_views
-from flows.jobs.access import read_cameras, read_images, views_with_role
+from flows.jobs.access import read_cameras, read_images, read_masks, views_with_role
 from flows.jobs.job import Job
 from flows.media.images import resize
 from schemas.decisions import Decision, chosen, skipped
@@ -44,10 +44,14 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
         images += [view.image for view in made]
         if not made:
             text = "Trained on captured views alone, without the LPIPS loss: no view was generated."
-            decisions.append(skipped(text, "covered_path"))
+            decisions.append(skipped(text))
     captured = torch.arange(len(cameras)) < len(train)
+    masks = read_masks(store, train)
+    if masks is not None:
+        masks += [None] * (len(cameras) - len(train))
+        decisions.append(skipped("Pixels outside the masks of captured views were not trained on."))
     maps = hint_maps(len(train), made)
-    views, more = unseen_alone(job, Views.from_images(cameras, images, captured, **maps))
+    views, more = unseen_alone(job, Views.from_images(cameras, images, captured, masks, **maps))
     return views, decisions + more
 
 

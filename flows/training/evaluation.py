@@ -30,44 +30,23 @@ from cat3d_core.metrics.psnr import psnr
 from cat3d_core.metrics.ssim import ssim
 from cat3d_core.normalization import normalize_scene
 from cat3d_core.random import normal
-from cat3d_core.rays import image_rays
 from cat3d_core.sample_sets import sample_cameras, source_boxes
 from cat3d_core.synthetic import FAMILIES
 from cat3d_core.synthetic.held_out import held_out_group
 from cat3d_core.synthetic.tracer import Traced
 from cat3d_core.view_selection import camera_distance
+from cat3d_core.warp import warp
 from flows.errors import InputError
 from flows.generation.formats import cat3d
-from flows.jobs.device import device
+from flows.jobs.device import exact_device
 from flows.media.images import read_image, square_image, write_png
 from flows.readers.base import read_capture
-from flows.training.worlds.held_out import held_out_worlds
+from flows.training.worlds.held_out import HeldOutWorld, held_out_worlds
 
 CAPTURED = ("llff_fern", "dtu_scan24", "co3d_apple", "re10k_bedroom", "mipnerf360_bonsai", "fox")
 ALL_CAPTURED = "all captured"
 WORLDS = "held-out worlds"
-
-
-def warp(traced: Traced, cameras: Cameras, target: int, sources: list[int]) -> tuple[Tensor, Tensor]:
-    """Carry `sources` (best first) into `target` by its true depth: image (3, H, W), seen (H, W) bool."""
-    height, width = traced.depth.shape[-2:]
-    depth = traced.depth[target].reshape(-1, 1).double()
-    # The sky is far away, not nowhere.
-    depth = torch.where(depth.isfinite(), depth, torch.full_like(depth, 1e4))
-    rays = image_rays(cameras, target)
-    image, seen = torch.zeros(3, height * width), torch.zeros(height * width, dtype=torch.bool)
-    pixels, z = cameras.project(rays.origins + depth * rays.directions)
-    for source in sources:
-        grid = (pixels[source] / torch.tensor([width, height]) * 2 - 1).float()[None, :, None]
-        there = torch.nan_to_num(traced.depth[source], posinf=1e4)[None, None]
-        reached = F.grid_sample(there, grid, mode="nearest", align_corners=False)[0, 0, :, 0]
-        visible = (
-            (grid[0, :, 0].abs() <= 1).all(-1) & (z[source] > 0) & ((reached - z[source]).abs() < 0.03 * z[source])
-        )
-        colour = F.grid_sample(traced.image[source][None], grid, align_corners=False, padding_mode="border")[0, :, :, 0]
-        new = visible & ~seen
-        image[:, new], seen = colour[:, new], seen | visible
-    return image.reshape(3, height, width), seen.reshape(height, width)
+METHODS = ("sample", "nearest", "warp", "autoencoder")
 
 
 def captured_group(scene: Path, size: int, given: int, views: int = 8) -> tuple[Tensor, Cameras]:
@@ -87,6 +66,13 @@ def captured_group(scene: Path, size: int, given: int, views: int = 8) -> tuple[
     squares = [square_image(read_image(capture.paths[i])[0], box, size) for i, box in zip(chosen, boxes, strict=True)]
     images = torch.stack([torch.from_numpy(square).permute(2, 0, 1).float() / 255 for square in squares])
     return images, sample_cameras(cameras, "square", size)
+
+
+def world_group(world: HeldOutWorld, size: int) -> tuple[Traced, Cameras]:
+    """A held-out world at another size, as `held_out_group` gives a procedural scene."""
+    image = F.interpolate(world.image, (size, size), mode="area")
+    depth = F.interpolate(world.depth[:, None], (size, size))[:, 0]
+    return Traced(image, depth, torch.zeros_like(image)), world.cameras.resize(size, size)
 
 
 def evaluate_group(
@@ -109,7 +95,9 @@ def warped(traced: Traced, cameras: Cameras, given: int) -> Tensor:
     order = camera_distance(cameras)[given:, :given].argsort(1)
     images = []
     for row, target in enumerate(range(given, len(cameras))):
-        image, seen = warp(traced, cameras, target, order[row].tolist())
+        near = order[row].tolist()
+        photos, depths = traced.image[near], traced.depth[near]
+        image, seen = warp(list(photos), list(depths), cameras[near], cameras[target], traced.depth[target])
         images.append(torch.where(seen, image, traced.image[order[row, 0]]))
     return torch.stack(images)
 
@@ -149,24 +137,22 @@ def rows(
                 images["warp"] = warped(traced, cameras, given)
                 take((family, "all"), given, images)
                 if pictures is not None and number < 3:
-                    _contact_sheet(pictures / f"{family}_{number}_{given}.png", traced.image[:given], images)
+                    contact_sheet(pictures / f"{family}_{number}_{given}.png", traced.image[:given], images)
     for world in held_out_worlds(worlds, views) if worlds else ():
-        image = F.interpolate(world.image, (size, size), mode="area")
-        traced = Traced(image, F.interpolate(world.depth[:, None], (size, size))[:, 0], torch.zeros_like(image))
-        cameras = world.cameras.resize(size, size)
+        traced, cameras = world_group(world, size)
         for given in conditions:
-            images = evaluate_group(generator, image, cameras, given, sampler, (world.name,))
+            images = evaluate_group(generator, traced.image, cameras, given, sampler, (world.name,))
             images["warp"] = warped(traced, cameras, given)
             take((WORLDS,), given, images)
             if pictures is not None:
-                _contact_sheet(pictures / f"world_{world.name}_{given}.png", image[:given], images)
+                contact_sheet(pictures / f"world_{world.name}_{given}.png", traced.image[:given], images)
     for scene in captured:
         for given in conditions:
             image, cameras = captured_group(scene, size, given, views)
             images = evaluate_group(generator, image, cameras, given, sampler, (scene.name,))
             take((scene.name, ALL_CAPTURED), given, images)
             if pictures is not None:
-                _contact_sheet(pictures / f"{scene.name}_{given}.png", image[:given], images)
+                contact_sheet(pictures / f"{scene.name}_{given}.png", image[:given], images)
     out = []
     for (label, given, method), found in scores.items():
         means = {name: round(sum(s[name] for s in found) / len(found), 4) for name in found[0]}
@@ -188,10 +174,13 @@ def table(result: list[dict[str, Any]], metric: str = "psnr") -> str:
     return "\n".join(lines)
 
 
-def _contact_sheet(path: Path, given: Tensor, images: dict[str, Tensor]) -> None:
+def contact_sheet(path: Path, given: Tensor, images: dict[str, Tensor], names: Sequence[str] = METHODS) -> None:
+    """A PNG, twice as large: the given views and the truth in the first line, then a line per name that there is of.
+
+    given (M, 3, H, W) and images (N, 3, H, W) in [0, 1], `truth` among them."""
     path.parent.mkdir(parents=True, exist_ok=True)
     blank = torch.ones(len(given), *given.shape[1:])
-    shown = [name for name in ("sample", "nearest", "warp", "autoencoder") if name in images]
+    shown = [name for name in names if name in images]
     lines = [torch.cat([given, images["truth"]])] + [torch.cat([blank, images[name]]) for name in shown]
     sheet = torch.cat([torch.cat(list(line), -1) for line in lines], -2)
     write_png(path, F.interpolate(sheet[None], scale_factor=2, mode="nearest")[0].permute(1, 2, 0))
@@ -212,7 +201,7 @@ def evaluate_file(
 ) -> str:
     """Markdown tables of PSNR, SSIM and (where weights are found) perceptual distance of a model file."""
     perceptual = find_perceptual()
-    generator = cat3d.load(path, device(), "bfloat16")
+    generator = cat3d.load(path, exact_device(), "bfloat16")
     result = rows(
         generator, scenes, sampler=sampler, perceptual=perceptual, pictures=pictures,
         captured=captured_scenes(data), worlds=worlds,

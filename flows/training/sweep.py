@@ -26,12 +26,14 @@ from flows.training.loop import crossed
 from flows.training.prepare import claim, read_photos
 from flows.training.ranks import Ranks
 from flows.training.sweep_batches import GeometryBank, batch, collated, prepared
+from flows.training.worlds.package import TRAINING
+from flows.training.worlds.shards import SHARD_GROUPS, shard_numbers, world_shards
 from schemas.errors import ConfigError
 from schemas.sweep_training import SWEEP_TRAINING, SWEEP_VALIDATION, SweepRunConfig, SweepStage
 from schemas.tables import append_rows
 
 RECORD, STATE, WEIGHTS = "training.json", "state.safetensors", "sweep.safetensors"
-TABLES, VALIDATION = "training", "validation"
+TABLES, VALIDATION, WORLDS = "training", "validation", "worlds"
 #: Settings that may change between the legs of one training.
 FREE = {"name", "note", "steps", "minutes", "device", "log_steps", "save_minutes", "validate_minutes"}
 _VALIDATED = (3, 1)
@@ -59,7 +61,8 @@ def train_sweep(config: SweepRunConfig, out: Path, own: Ranks, bank_only: bool =
     render_bank(config, folder, own)
     if bank_only or not own.first:
         return
-    bank = GeometryBank([folder, *config.bank.others], config.bank.held)
+    worlds = [folder / WORLDS] if config.bank.worlds else []
+    bank = GeometryBank([folder, *worlds, *config.bank.others], config.bank.held)
     empty = [str(path) for path in bank.folders if not renders.shards(path, "renders")]
     if empty:
         raise InputError(f"There are no scenes (renders/*.safetensors) in {', '.join(empty)}.")
@@ -95,10 +98,15 @@ def starting_network(config: SweepRunConfig) -> SweepNetwork:
 
 
 def render_bank(config: SweepRunConfig, folder: Path, own: Ranks) -> None:
-    """Render the procedural scenes that are not there yet."""
+    """Render the procedural scenes, and the worlds, that are not there yet."""
     bank, seed = config.bank, config.seed if config.bank.seed is None else config.bank.seed
     if own.first:
-        identity = {**json.loads(bank.model_dump_json(exclude={"folder", "others", "held", "scenes"})), "seed": seed}
+        identity = {
+            **json.loads(
+                bank.model_dump_json(exclude={"folder", "others", "held", "scenes", "worlds", "world_groups"})
+            ),
+            "seed": seed,
+        }
         claim(folder / "bank.json", identity, set(identity) if renders.shards(folder, "renders") else ())
     own.barrier()
     numbers = renders.shard_numbers(bank.scenes)
@@ -112,6 +120,10 @@ def render_bank(config: SweepRunConfig, folder: Path, own: Ranks) -> None:
             folder, bank.families, bank.scenes, bank.views, bank.size, seed, photos, own.device, mine, bar.advance,
             with_depth=True,
         )  # fmt: skip
+    if bank.worlds:
+        turns = shard_numbers(bank.world_groups)[own.rank :: own.world]
+        with meter("photograph worlds", SHARD_GROUPS * len(turns)) as bar:
+            world_shards(folder / WORLDS, bank.worlds, TRAINING, turns, bank.views, bank.size, seed, bar.advance)
     own.barrier()
 
 

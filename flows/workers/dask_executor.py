@@ -20,7 +20,7 @@ from prefect import task
 from prefect.cache_policies import NO_CACHE
 from prefect_dask.client import PrefectDaskClient
 
-from flows.jobs.device import visible_gpus
+from flows.jobs.device import worker_count
 from flows.workers.work import Answer, Batch, run_batch
 from schemas.config import ExecutionConfig
 from schemas.errors import ConfigError
@@ -101,7 +101,7 @@ class DaskExecutor:
 
 def make_cluster(settings: ExecutionConfig) -> Any:
     """Start the cluster the settings name. Raises ConfigError for a class that isn't there."""
-    count = settings.workers or len(visible_gpus()) or max(1, len(os.sched_getaffinity(0)) // settings.threads)
+    count = worker_count(settings)
     if settings.dask_cluster is None:
         # Loopback only: by default the dashboard and, without processes, a worker port listen on all addresses.
         defaults = {

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import BinaryIO, cast
 
-from flows.jobs.device import visible_gpus
+from flows.jobs.device import visible_gpus, worker_count
 from flows.workers.work import Answer, Batch
 from schemas.config import ExecutionConfig
 
@@ -24,7 +24,7 @@ class LocalExecutor:
 
     def __init__(self, settings: ExecutionConfig, log_folder: Path) -> None:
         self.gpus = visible_gpus()
-        self.count = settings.workers or len(self.gpus) or max(1, len(os.sched_getaffinity(0)) // settings.threads)
+        self.count = worker_count(settings)
         self.threads = settings.threads
         self.log_folder = log_folder
         self.running: dict[int, _Worker] = {}  # by place, 0 to count - 1

@@ -10,7 +10,7 @@
 # left in OUT is made to travel: few files of at most 15 MiB. Another `train` on the same machine is another leg, from the
 # weights of the last one and on its bank; elsewhere a leg starts from the shipped weights.
 #
-# PRESET=default_gpu  SETTINGS="optimizer.groups=128 ..."  TEXTURES=FOLDER  SCENES=4 (held out, a family)  RESERVE=100
+# PRESET=default_gpu, or sweep_gpu for the plane sweep  SETTINGS="optimizer.groups=128 ..."  TEXTURES=FOLDER  SCENES=4 (held out, a family)  RESERVE=100
 # (seconds kept for evaluating and packing)  RANKS (processes that render the bank; all cores)  WORK=outputs/lease  WHEELS=.whl
 set -euo pipefail
 cd "$(dirname "$0")/../.."
@@ -32,37 +32,48 @@ wheels() {
 }
 
 train() {
-  local out=$1 seconds=${2:-560} preset=${PRESET:-default_gpu} start=cat3d_core/weights/default.safetensors leg settings=()
+  local out=$1 seconds=${2:-560} preset=${PRESET:-default_gpu} name=default file=model prefix="" start leg settings=()
+  if grep -q '^kind: sweep' "flows/training/presets/$preset.yaml"; then name=sweep file=sweep prefix=sweep_; fi
+  start=cat3d_core/weights/$name.safetensors
   mkdir -p "$out" "$WORK"
   site
-  leg=$(find "$WORK" -maxdepth 1 -name 'leg_*' | wc -l)
+  leg=$(find "$WORK" -maxdepth 1 -name "${prefix}leg_*" | wc -l)
   for done in $(seq 0 $((leg - 1))); do
-    if [ -f "$WORK/leg_$done/model.safetensors" ]; then start=$WORK/leg_$done/model.safetensors; fi
+    if [ -f "$WORK/${prefix}leg_$done/$file.safetensors" ]; then start=$WORK/${prefix}leg_$done/$file.safetensors; fi
   done
-  for setting in ${SETTINGS:-} "bank.folder=$WORK/bank" "bank.seed=1" "seed=$((leg + 1))" ${TEXTURES:+"bank.textures=$TEXTURES"}; do
+  for setting in ${SETTINGS:-} "bank.folder=$WORK/${prefix}bank" "bank.seed=1" "seed=$((leg + 1))" ${TEXTURES:+"bank.textures=$TEXTURES"}; do
     settings+=(--set "$setting")
   done
   # Rendering is many small steps: all cores do it sooner than the GPU would.
   OMP_NUM_THREADS=1 "$PYTHON" -m torch.distributed.run --standalone --nproc-per-node "${RANKS:-$(nproc)}" -m flows.cli \
-    train "$preset" --out "$WORK/bank" --bank-only --device cpu "${settings[@]}"
+    train "$preset" --out "$WORK/${prefix}bank" --bank-only --device cpu "${settings[@]}"
   local left=$((seconds - SECONDS - ${RESERVE:-100}))
   if [ "$left" -lt 5 ]; then echo "The bank took $SECONDS s: no time is left to train in; ask for fewer bank.scenes." >&2; exit 1; fi
-  "$PYTHON" -m flows.cli train "$preset" --out "$WORK/leg_$leg" --start "$start" "${settings[@]}" \
+  "$PYTHON" -m flows.cli train "$preset" --out "$WORK/${prefix}leg_$leg" --start "$start" "${settings[@]}" \
     --minutes "$(awk "BEGIN { print $left / 60 }")"
-  "$PYTHON" infra/export_default.py "$WORK/leg_$leg" --scenes "${SCENES:-4}" --to "$out" --threads "$(nproc)"
-  tar czf "$out/training.tar.gz" -C "$WORK/leg_$leg" training samples training.json
-  (cd "$out" && sha256sum default.safetensors >default.sha256 && split -b 15M -d default.safetensors default.part. && rm default.safetensors)
+  if [ "$name" = sweep ]; then
+    "$PYTHON" -m infra.export_sweep "$WORK/sweep_leg_$leg" --to "$out/sweep.safetensors"
+    if [ "${SCENES:-1}" -gt 0 ]; then
+      "$PYTHON" -m flows.training.sweep_evaluation "$out/sweep.safetensors" --scenes "${SCENES:-1}" --cache "$WORK/sweep_bench" --json "$out/sweep.json"
+    fi
+    tar czf "$out/training.tar.gz" -C "$WORK/sweep_leg_$leg" training validation training.json
+  else
+    "$PYTHON" infra/export_default.py "$WORK/leg_$leg" --scenes "${SCENES:-4}" --to "$out" --threads "$(nproc)"
+    tar czf "$out/training.tar.gz" -C "$WORK/leg_$leg" training samples training.json
+  fi
+  (cd "$out" && sha256sum $name.safetensors >$name.sha256 && split -b 15M -d $name.safetensors $name.part. && rm $name.safetensors)
   echo "Leg $leg: $SECONDS s in all, $left of them training, from $start. Left in $out:"
   ls -l "$out"
 }
 
 join() {
-  local whole
+  local whole name=default
+  if [ -f "$1/sweep.sha256" ]; then name=sweep; fi
   whole=$(mktemp -d)
-  cat "$1"/default.part.* >"$whole/default.safetensors"
-  (cd "$whole" && sha256sum --quiet -c -) <"$1/default.sha256" # parts missing or damaged: stop before anything is replaced
-  install -m 644 "$whole/default.safetensors" "${2:-cat3d_core/weights}/default.safetensors"
-  install -m 644 "$1/model_card.md" "${3:-docs}/model_card.md"
+  cat "$1"/$name.part.* >"$whole/$name.safetensors"
+  (cd "$whole" && sha256sum --quiet -c -) <"$1/$name.sha256" # parts missing or damaged: stop before anything is replaced
+  install -m 644 "$whole/$name.safetensors" "${2:-cat3d_core/weights}/$name.safetensors"
+  if [ $name = default ]; then install -m 644 "$1/model_card.md" "${3:-docs/explanation}/model_card.md"; fi
   rm -r "$whole"
 }
 

@@ -12,6 +12,7 @@ from cat3d_core.diffusion.config import ModelConfig, from_dict
 from cat3d_core.generation import Cat3dGenerator, GeneratorSpec, cat3d_spec
 from cat3d_core.weights import default_model_path
 from flows.errors import InputError
+from flows.jobs.device import exact_device
 
 LOOKS_FOR = "a .safetensors file that `cat3d train` wrote, such as the one shipped"
 
@@ -41,7 +42,8 @@ def load(path: Path | None, device: str, precision: str) -> Cat3dGenerator:
     """The model on `device`, checked against its hash; `precision` is the U-Net's, the autoencoder stays in float32.
 
     Raises ValueError for a file that is damaged or no such model."""
-    model = load_model(_file(path), device)
+    # Cameras are told in float64.
+    model = load_model(_file(path), exact_device() if device == "mps" else device)
     model.unet.to(getattr(torch, precision))
     return Cat3dGenerator(model, describe(path))
 

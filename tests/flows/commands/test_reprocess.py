@@ -3,6 +3,7 @@ there. Two methods and two splits of six small photos, with real Prefect runs.""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from flows.jobs.metric_table import metric_table
 from flows.media import images
 from flows.pipeline.sweep import run_sweep
 from flows.reporting.summary import timing_rows
+from flows.stages import STAGES, render
 from schemas.config import SweepConfig, parse_config
 from schemas.scene_store import SceneStore
 from schemas.tables import read_rows
@@ -125,13 +127,18 @@ def test_views_of_one_split(root: Path, monkeypatch: pytest.MonkeyPatch) -> dict
 test_views_of_one_split.__test__ = False
 
 
+def raise_version(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    stages = tuple(dataclasses.replace(one, version=99) if one.name == name else one for one in STAGES)
+    monkeypatch.setattr("flows.pipeline.keys.STAGES", stages)
+
+
 def a_stages_version(root: Path, monkeypatch: pytest.MonkeyPatch) -> dict:
-    monkeypatch.setattr("flows.stages.decode.VERSION", 99)
+    raise_version("decode", monkeypatch)
     return every([], GENERATED[1:])
 
 
 def the_last_stages_version(root: Path, monkeypatch: pytest.MonkeyPatch) -> dict:
-    monkeypatch.setattr("flows.stages.evaluate.VERSION", 99)
+    raise_version("evaluate", monkeypatch)
     return every(["evaluate"], ["evaluate"])
 
 
@@ -268,8 +275,6 @@ def test_old_results_stay_until_the_new_are_complete(root: Path, monkeypatch, pr
     images.write_png(root / "room" / "images" / "0002.png", np.full((20, 24, 3), 90, np.uint8))
     old_image = SceneStore.open(out / "room.zarr").captured.read("image")
     old_rows = read_rows(out / "metrics", metric_table()).to_pylist()
-    from flows.stages import render
-
     execute = render.execute
 
     def fail_in_the_second_run(job, *rest):
@@ -277,7 +282,8 @@ def test_old_results_stay_until_the_new_are_complete(root: Path, monkeypatch, pr
             raise RuntimeError("stopped midway")
         return execute(job, *rest)
 
-    monkeypatch.setattr(render, "execute", fail_in_the_second_run)
+    replaced = (dataclasses.replace(s, execute=fail_in_the_second_run) if s.name == "render" else s for s in STAGES)
+    monkeypatch.setattr("flows.pipeline.keys.STAGES", tuple(replaced))
     pictures = {p: p.read_bytes() for p in out.rglob("*.png")}
     with pytest.raises(RuntimeError, match="midway"):
         redo(find_stale(out, where=where)[0])

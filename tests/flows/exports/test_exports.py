@@ -326,7 +326,7 @@ def test_both_frames_are_one_similarity_apart(stored: Path, tmp_path: Path) -> N
 
 
 def test_splats_of_a_run_look_like_its_field_in_the_worlds_frame(stored: Path, tmp_path: Path) -> None:
-    settings = SurfaceSettings(splats=3000, refine=40)
+    settings = SurfaceSettings(splats=3000, refine=200)
     files = export_command(stored, None, "splats", tmp_path, "world", settings)
     assert [file.name for file in files] == ["splats.ply", "splats.splat", "splats.spz"]
     source = open_source(stored, None, "world")
@@ -351,7 +351,7 @@ def test_views_of_the_run_are_exported_as_stored(stored: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "fault"),
     [
-        ({"what": "splats"}, '"splats" cannot be exported; choose among mesh'),
+        ({"what": "surfels"}, '"surfels" cannot be exported; choose among mesh'),
         ({"what": "renders"}, "--path FILE.json"),
         ({"frame": "camera"}, "no frame"),
         ({"run_name": "v3-cat3d"}, "has no run"),

@@ -14,7 +14,7 @@ from cat3d_core.sample_sets import source_boxes
 from flows.errors import InputError
 from flows.generation.groups import StoredPlan
 from flows.generation.open import open_generator
-from flows.generation.views import generated_views
+from flows.generation.views import GeneratedView, generated_views
 from flows.jobs.job import Job
 from flows.jobs.request import Request, make_config, make_request
 from flows.media.images import PADDING, read_image, square_image
@@ -149,8 +149,13 @@ def test_generated_views_finer_than_the_photos_are_reduced_to_their_focal_length
     intrinsics = torch.tensor([[[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]])
     camera = Cameras(intrinsics, torch.eye(4)[None], torch.tensor([[64, 48]]))
     image = torch.full((48, 64, 3), 90, dtype=torch.uint8)
-    assert no_finer(camera, image, 100.0) == (camera, image)
-    reduced, smaller = no_finer(camera, image, 50.0)
+    trust = torch.linspace(0, 1, 48 * 64).reshape(48, 64)
+    whole = GeneratedView(camera, image, trust)
+    assert no_finer(whole, 100.0) is whole
+    reduced, smaller, trusted, *depths = no_finer(whole, 50.0)
+    assert trusted is not None
+    assert trusted.shape == (24, 32)
+    assert depths == [None, None]
     assert reduced.size.tolist() == [[32, 24]]
     torch.testing.assert_close(reduced.intrinsics[0, :2], intrinsics[0, :2] / 2)
     assert torch.equal(smaller, torch.full((24, 32, 3), 90, dtype=torch.uint8))

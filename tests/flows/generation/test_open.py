@@ -86,7 +86,7 @@ def test_what_cannot_be_opened_ends_in_a_sentence(model: Path, tmp_path: Path) -
     assert f"{text} is no model that a generator recognises" in told
     assert "cat3d: a .safetensors file that `cat3d train` wrote" in told
     assert "sample.checkpoint" in refused(f"sample.checkpoint={text}", "sample.generator=cat3d")
-    assert "no generator 'seven'; installed are cat3d" in refused("sample.generator=seven")
+    assert "no generator 'seven'; installed are seva, cat3d" in refused("sample.generator=seven")
     strange = tmp_path / "strange.safetensors"
     save_model(strange, MultiViewModel(SIZES["tiny"]), {"sampler": {"steps": 3, "colour": "blue"}})
     assert "colour" in refused(f"sample.checkpoint={strange}")

@@ -16,10 +16,8 @@ from PIL import Image, ImageOps
 
 from cat3d_core.cameras import Cameras
 from flows.errors import InputError
+from flows.media.files import exif_focal_px, image_size, list_images
 from flows.media.images import (
-    exif_focal_px,
-    image_size,
-    list_images,
     read_image,
     read_mask,
     resize,
@@ -169,7 +167,7 @@ def _bad_files(folder, pixels) -> dict[str, tuple[str, str]]:
         "zero bytes": ("zero.png", "is empty (0 bytes)"),
         "text": ("text.jpg", "is not an image that can be read"),
         "bomb": ("bomb.png", "claims a 10299 MB image"),
-        "heic": ("phone.heic", "HEIC/AVIF file, which cannot be read here; convert"),
+        "heic": ("phone.heic", "HEIC/AVIF file"),
         "raw": ("camera.CR2", "camera RAW file"),
         "cmyk": ("print.jpg", "CMYK image"),
         "nan": ("nan.exr", "NaN or infinite pixels"),

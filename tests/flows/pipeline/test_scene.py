@@ -177,11 +177,11 @@ def test_only_one_command_writes_a_store(tmp_path: Path) -> None:
         (["run", "procedural:moon/1"], 1, "moon"),
         (["run", SCENE, "--set", "render.frames=3"], 1, "frames is not a setting"),
         (["run", SCENE, "--set", "nonsense"], 1, "write it as NAME=VALUE"),
-        (["run", SCENE, "--preset", "best"], 1, "reconstruct.preset is 'best'"),
+        (["run", SCENE, "--preset", "best"], 1, "reconstruct.preset: 'best' is none of zipnerf's"),
         (["run", SCENE, "--reader", "magic"], 1, 'There is no reader "magic"'),
         (["run", SCENE, "--set", "reconstruct.overrides={speed: 3}"], 1, "speed is not a setting of the trainer"),
         (["inspect", "/nonexistent.zarr"], 1, "does not exist"),
-        (["run"], 2, "Missing argument"),
+        (["run"], 2, "Give the scene's folder, or --prompt"),
         (["fly"], 2, "No such command"),
     ],
 )

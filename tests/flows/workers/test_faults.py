@@ -62,7 +62,7 @@ def test_a_killed_workers_groups_are_taken_over(scene, expected) -> None:
     with Trouble(job, signal.SIGKILL) as trouble:
         record = run_stages(job, "sample")["sample"]
     assert len(trouble.struck) == 1
-    assert any("was killed by SIGKILL" in d and "handed to another" in d.text for d in record.decisions)
+    assert any("was killed by SIGKILL" in d.text and "handed to another" in d.text for d in record.decisions)
     assert np.array_equal(run_of(job).generated.read("latent"), expected["3"])
     assert leftovers(job.store_path) == []
     assert workers_of(os.getpid()) == []

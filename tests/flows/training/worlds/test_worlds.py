@@ -15,6 +15,9 @@ from cat3d_core.synthetic.capture import look_at
 from cat3d_core.synthetic.tracer import Traced
 from flows.errors import InputError
 from flows.training.evaluation import warp
+from flows.training.ranks import Ranks
+from flows.training.sweep import render_bank
+from flows.training.sweep_batches import GeometryBank
 from flows.training.worlds import package as stk
 from flows.training.worlds.groups import NEARER, Studio, group, view_depth, view_light
 from flows.training.worlds.held_out import held_out_worlds
@@ -26,6 +29,7 @@ from flows.training.worlds.shards import FIRST_FAMILY, open_track, world_shards
 from flows.training.worlds.spm import read_spm, unpacked_normals
 from flows.training.worlds.textures import LINEAR_FROM_SRGB, Atlas, mip_levels, read_texture
 from flows.training.worlds.world import World
+from schemas.sweep_training import SweepRunConfig
 
 MINI = ("mini",)
 
@@ -291,6 +295,22 @@ def test_shards_are_resumed_and_read_back_as_held_out_worlds(package: Path, tmp_
         next(held_out_worlds(tmp_path, views=9))
     with pytest.raises(InputError, match="cat3d worlds"):
         next(held_out_worlds(tmp_path / "none"))
+
+
+def test_a_plane_sweep_draws_worlds_as_often_as_procedural_scenes(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flows.training.worlds.shards.SHARD_GROUPS", 2)
+    monkeypatch.setattr("flows.training.sweep.TRAINING", MINI)
+    bank = {"families": ["llff"], "scenes": 2, "views": 4, "size": 32, "worlds": str(package), "world_groups": 4}
+    stages = [{"size": 32, "share": 1}]
+    config = SweepRunConfig.model_validate({"bank": bank, "stages": stages, "photos": [1], "steps": 1})
+    render_bank(config, tmp_path, Ranks(0, 1, torch.device("cpu")))
+    found = GeometryBank([tmp_path, tmp_path / "worlds"], held=1)
+    assert found.named() == [tmp_path.name, "worlds"]
+    assert [len(shards) for shards in found.sources(validation=True)] == [1, 1]
+    assert len(found.sources()) == 1  # the procedural scenes are all in the shard that is held
+    assert found.draw(torch.Generator().manual_seed(0))["image"].shape == (4, 3, 32, 32)
 
 
 def test_no_held_out_track_is_trained_on() -> None:

@@ -20,8 +20,8 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.matching.checkpoint import load_sweep
 from cat3d_core.matching.composite import Composite
 from cat3d_core.matching.network import SweepNetwork
-from flows.bench.sweep import VIEWS, Case, case, sampled, swept
 from flows.training.renders import save, shards
+from flows.training.sweep_evaluation import VIEWS, Case, case, sampled, swept
 
 MIDDLES = torch.linspace(0.05, 0.75, 15).tolist()
 SOFTNESSES = (0.05, 0.1, 0.15, 0.2, 0.3)
@@ -36,7 +36,7 @@ def validation_cases(folders: Sequence[Path], cache: Path, scenes: int, given: S
                 path = cache / f"held_{folder.name}_{number:03d}_{m}.safetensors"
                 if not path.exists():
                     save(path, _group(shard, number, m))
-                yield case((folder.name,), m, load_file(path))
+                yield case(path.stem, (folder.name,), m, load_file(path))
 
 
 def _group(shard: dict[str, Tensor], number: int, given: int) -> dict[str, Tensor]:
@@ -62,7 +62,8 @@ def fitted(network: SweepNetwork, found: Iterator[Case]) -> tuple[Composite, dic
         errors.setdefault((one.labels[0], one.given), []).append(torch.stack(decibels))
     mean = torch.stack([torch.stack(several).mean(0) for several in errors.values()]).mean(0)
     best = int(mean[2:].argmax())
-    return grid[best], {"sweep": float(mean[0]), "sample": float(mean[1]), "composite": float(mean[2 + best])}
+    numbers = {"sweep": mean[0], "sample": mean[1], "composite": mean[2 + best]}
+    return grid[best], {name: round(float(value), 3) for name, value in numbers.items()}
 
 
 def main() -> None:

@@ -1,20 +1,22 @@
-"""The plane sweep on the scenes of `flows/training/evaluation.py`: held-out procedural scenes and captured ones.
+"""The plane sweep on the scenes of `flows/training/evaluation.py`: held-out procedural scenes, worlds, captured ones.
 
 For each target view of a group of 8 (M given, 8 - M targets), against its exact render or photograph:
   nearest      the nearest given view, copied
   sample       the shipped diffusion model's sample
   sweep        what the photos show of it, as the plane sweep finds it
   composite    the sweep where it is confident, the sample elsewhere
-  warp         the given views carried over by the target's true depth; holes keep `nearest` (procedural scenes)
+  warp         the given views carried over by the target's true depth; holes keep `nearest` (not for captured ones)
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -35,18 +37,30 @@ from cat3d_core.synthetic import FAMILIES
 from cat3d_core.synthetic.held_out import held_out_group
 from cat3d_core.weights import default_model_path
 from flows.generation.formats import cat3d
-from flows.training.evaluation import ALL_CAPTURED, captured_group, captured_scenes, evaluate_group, warped
+from flows.training.evaluation import (
+    ALL_CAPTURED,
+    WORLDS,
+    captured_group,
+    captured_scenes,
+    contact_sheet,
+    evaluate_group,
+    warped,
+    world_group,
+)
 from flows.training.renders import save
+from flows.training.worlds.held_out import HeldOutWorld, held_out_worlds
 
 SIZE, VIEWS = 128, 8
 METHODS = ("nearest", "sample", "sweep", "composite", "warp")
+SHOWN = ("nearest", "warp", "sample", "sweep", "composite", "confidence")
 
 
 @dataclass(frozen=True)
 class Case:
-    """One group: labels it counts under, `given` views of image (V, 3, H, W), normalised cameras, the pictures
-    (V - given, 3, H, W) of the methods that need no sweep, and the targets' inverse depth where it is known."""
+    """One group: its name, the labels it counts under, `given` views of image (V, 3, H, W), normalised cameras,
+    pictures (V - given, 3, H, W) of methods that need no sweep, and the targets' inverse depth where it is known."""
 
+    name: str
     labels: tuple[str, ...]
     given: int
     image: Tensor
@@ -55,26 +69,33 @@ class Case:
     inverse_depth: Tensor | None
 
 
-def cases(cache: Path, scenes: int, given: Sequence[int], data: Path | None) -> Iterator[Case]:
-    """Procedural scenes of each family, then captured ones. What takes long is kept in `cache`."""
+def cases(
+    cache: Path, scenes: int, given: Sequence[int], data: Path | None, worlds: Path | None = None, groups: int = 0
+) -> Iterator[Case]:
+    """Procedural scenes of each family, captured ones, and the first groups of held-out worlds (fewer where there are
+    fewer). What takes long is kept in `cache`."""
     for number in range(scenes):
         for family in FAMILIES:
             for m in given:
                 stored = _procedural(cache / f"{family}_{number:03d}_{m}.safetensors", family, number, m)
-                yield case((family, "all"), m, stored)
+                yield case(f"{family}_{number}", (family, "all"), m, stored)
     for scene in captured_scenes(data):
         for m in given:
-            yield case((scene.name, ALL_CAPTURED), m, _captured(cache / f"{scene.name}_{m}.safetensors", scene, m))
+            stored = _captured(cache / f"{scene.name}_{m}.safetensors", scene, m)
+            yield case(scene.name, (scene.name, ALL_CAPTURED), m, stored)
+    for world in islice(held_out_worlds(worlds, VIEWS), groups) if worlds else ():
+        for m in given:
+            yield case(world.name, (WORLDS,), m, _world(cache / f"world_{world.name}_{m}.safetensors", world, m))
 
 
-def case(labels: tuple[str, ...], given: int, stored: dict[str, Tensor]) -> Case:
+def case(name: str, labels: tuple[str, ...], given: int, stored: dict[str, Tensor]) -> Case:
     """A group as it is kept in the cache (`sampled`)."""
     stored = dict(stored)
     image = stored.pop("image")
     size = torch.tensor([[image.shape[-1], image.shape[-2]]]).repeat(len(image), 1)
     cameras = Cameras(stored.pop("intrinsics"), stored.pop("world_from_camera"), size)
     depth = stored.pop("inverse_depth", None)
-    return Case(labels, given, image, cameras, {k: t.float() for k, t in stored.items()}, depth)
+    return Case(name, labels, given, image, cameras, {k: t.float() for k, t in stored.items()}, depth)
 
 
 _MODEL: list[Any] = []
@@ -98,6 +119,14 @@ def _procedural(path: Path, family: str, number: int, given: int) -> dict[str, T
     return load_file(path)
 
 
+def _world(path: Path, world: HeldOutWorld, given: int) -> dict[str, Tensor]:
+    if not path.exists():
+        traced, cameras = world_group(world, SIZE)
+        parts = sampled(traced.image, cameras, given, (world.name,))
+        save(path, parts | {"warp": warped(traced, cameras, given).half(), "inverse_depth": 1 / traced.depth[given:]})
+    return load_file(path)
+
+
 def _captured(path: Path, scene: Path, given: int) -> dict[str, Tensor]:
     if not path.exists():
         image, cameras = captured_group(scene, SIZE, given, VIEWS)
@@ -113,23 +142,33 @@ def swept(network: SweepNetwork, case: Case) -> Hint:
 
 
 def scores(
-    network: SweepNetwork, found: Iterator[Case], composite: Composite, perceptual: PerceptualDistance | None
-) -> list[dict[str, Any]]:
+    network: SweepNetwork, found: Iterator[Case], composite: Composite, perceptual: PerceptualDistance | None,
+    pictures: Path | None = None,
+) -> list[dict[str, Any]]:  # fmt: skip
     """One row per label, number of given views and method: means over groups of PSNR, SSIM and perceptual distance;
-    with the method `sweep`, also over its confident pixels (> 0.5) and the error of inverse depth."""
+    with the method `sweep`, also over its confident pixels (> 0.5), the error of inverse depth and seconds of the
+    processor a view.
+
+    pictures: a folder for a contact sheet of each group."""
     rows: dict[tuple[str, int, str], list[dict[str, float]]] = defaultdict(list)
     for case in found:
+        started = time.process_time()
         h, truth = swept(network, case), case.image[case.given :]
-        pictures = case.pictures | {
+        seconds = (time.process_time() - started) / len(truth)
+        images = case.pictures | {
             "sweep": h.colour, "composite": composite(h.colour, h.confidence, case.pictures["sample"]),
         }  # fmt: skip
-        for method, picture in pictures.items():
+        if pictures is not None:
+            shown = images | {"truth": truth, "confidence": h.confidence[:, None].expand(-1, 3, -1, -1)}
+            contact_sheet(pictures / f"{case.name}_{case.given}.png", case.image[: case.given], shown, SHOWN)
+        for method, picture in images.items():
             score = {"psnr": float(psnr(picture, truth).mean()), "ssim": float(ssim(picture, truth).mean())}
             if perceptual is not None:
                 score[perceptual.name] = float(perceptual(picture, truth).mean())
             score |= _confident(picture, truth, h.confidence)
             if method == "sweep":
-                score |= {"confidence": float(h.confidence.mean())} | _calibration(picture, truth, h.confidence)
+                score |= {"confidence": float(h.confidence.mean()), "cpu_s": seconds}
+                score |= _calibration(picture, truth, h.confidence)
                 if case.inverse_depth is not None:
                     score["depth_error"] = float((h.inverse_depth - case.inverse_depth).abs().mean())
             for label in case.labels:
@@ -191,24 +230,28 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=20, help="held-out scenes per family")
     parser.add_argument("--given", type=int, nargs="+", default=[3, 1])
     parser.add_argument("--data", type=Path, help="folder with captured scenes")
+    parser.add_argument("--worlds", type=Path, help="folder of held-out worlds (cat3d worlds PACKAGE --held-out DIR)")
+    parser.add_argument("--world-groups", type=int, default=60, help="of the held-out worlds, at most")
+    parser.add_argument("--pictures", type=Path, help="a folder for a contact sheet of each group")
     parser.add_argument("--cache", type=Path, default=Path("outputs/bench_sweep"))
     parser.add_argument("--json", type=Path, help="where the rows go")
     parser.add_argument("--captured-only", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)
     options.cache.mkdir(parents=True, exist_ok=True)
-    found = cases(options.cache, 0 if options.captured_only else options.scenes, options.given, options.data)
+    scenes = 0 if options.captured_only else options.scenes
+    found = cases(options.cache, scenes, options.given, options.data, options.worlds, options.world_groups)
     if options.network is None:
         for _ in found:
             pass
         return
     network, perceptual = load_sweep(options.network), find_perceptual()
-    rows = scores(network, found, network.composite, perceptual)
+    rows = scores(network, found, network.composite, perceptual, options.pictures)
     if options.json:
         options.json.write_text(json.dumps(rows))
     print(table(rows, perceptual.name if perceptual else None))
     for r in rows:
-        if r["label"].startswith("all"):
+        if r["label"].startswith("all") or r["label"] == WORLDS:
             print(json.dumps(r))
 
 
