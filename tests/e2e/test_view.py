@@ -88,7 +88,7 @@ def test_the_page_needs_no_network_and_shows_what_the_reconstruction_renders(
     names = tab.run("performance.getEntriesByType('resource').map(entry => entry.name)")
     assert [name for name in names if f"{HOST}:{viewer.port}" not in name and not name.startswith("data:")] == []
     # What the browser shows is that picture, to the left of the panel and below its notices.
-    shown = until(lambda: _like(tab.screenshot(tmp_path / "shot.png"), session), 60, 2)
+    shown = until(lambda: _like(tab.screenshot(tmp_path / "shot.png"), session), every=2)
     assert shown > 30
     tab.close()
 
