@@ -25,11 +25,6 @@ def generates(job: Job) -> bool:
     return job.generates
 
 
-def hinted(job: Job) -> bool:
-    """For `Stage.wanted`: where what photos show is carried into generated views."""
-    return job.hinted
-
-
 def _nothing(_config: RunConfig) -> dict[str, Any]:
     return {}
 

@@ -14,12 +14,13 @@ from cat3d_core.matching.network import SweepNetwork
 from cat3d_core.sample_sets import KINDS, sample_cameras
 from flows.generation.groups import view_keys
 from flows.generation.hints import OWN, UNEXPLAINED_SHARE, open_sweep, read_hint, sweep_identity
+from flows.generation.imported import samples
 from flows.generation.plan import read_plan
 from flows.generation.views import captured_sample
 from flows.jobs.access import read_cameras, views_with_role
 from flows.jobs.device import cpu_threads
 from flows.jobs.job import Job, Outcome
-from flows.jobs.stage import Stage, hinted
+from flows.jobs.stage import Stage
 from flows.media.images import to_uint8
 from flows.progress import meter
 from schemas.decisions import chosen, skipped
@@ -106,4 +107,9 @@ def _store(section: Section, views: list[int], found: Hint, keys: list[str]) -> 
     section.mark_done("done", [keys[view] for view in views], views)
 
 
-STAGE = Stage("match", execute, version=1, reads=("plan",), inputs=inputs, wanted=hinted)
+def wanted(job: Job) -> bool:
+    """Where hints are used, and views are generated here and not imported."""
+    return job.hinted and samples(job)
+
+
+STAGE = Stage("match", execute, version=1, reads=("plan",), inputs=inputs, wanted=wanted)
