@@ -33,7 +33,10 @@ class Job(BaseModel):
     _scene: Scene = PrivateAttr()
 
     def model_post_init(self, _context: Any) -> None:
-        self._scene = Scene(self.source, self.reader, self.image_folder, self.config.ingest.frames)
+        self._scene = self._place()
+
+    def _place(self) -> Scene:
+        return Scene(self.source, self.reader, self.image_folder, self.config.ingest.frames)
 
     @property
     def store_path(self) -> Path:
@@ -77,7 +80,9 @@ class Job(BaseModel):
 
     @property
     def scene(self) -> Scene:
-        """The scene where it lies; copies of a job share what was read of it."""
+        """The scene where it lies; copies of a job share what was read of it, unless they name another place."""
+        if self._scene != (place := self._place()):
+            self._scene = place
         return self._scene
 
     def sharing(self, scene: Scene) -> Job:

@@ -92,4 +92,4 @@ def matches(a: Features, b: Features, first: int | None = None) -> tuple[np.ndar
 def _arrays(keypoints: Any, descriptors: Any) -> tuple[np.ndarray, np.ndarray]:
     """(F, 3) x, y, scale in pixels, centres at integer + 0.5; (F, 128)."""
     points = np.array([[p.x, p.y, p.compute_scale()] for p in keypoints], np.float32).reshape(-1, 3)
-    return points, np.asarray(getattr(descriptors, "data", descriptors)).reshape(len(points), -1)
+    return points, np.asarray(getattr(descriptors, "data", descriptors)).reshape(len(points), 128)

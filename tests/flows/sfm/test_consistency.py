@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ import torch
 from flows.bench.cameras import DAMAGES, rows
 from flows.media.lens import distort
 from flows.readers import read_capture
-from flows.sfm.consistency import _distances, _split, check_consistency, evidence, judge
+from flows.sfm.consistency import _distances, _split, check_consistency, evidence, judge, measure_consistency
 from flows.sfm.matches import undistorted
 
 SCENE = "procedural:dtu/3?views=12&width=320&height=240"
@@ -55,10 +57,17 @@ def test_a_longer_way_to_one_view_is_told_by_the_third(scene):
     assert judge(poses, known).warnings(capture.names)
 
 
+def test_photos_without_features_say_nothing():
+    """A black photo among others, and photos that are black all."""
+    capture = read_capture("procedural:dtu/3?views=6&width=96&height=64")
+    some, every = list(capture.images), [np.zeros_like(image) for image in capture.images]
+    some[2] = every[2]
+    assert measure_consistency(replace(capture, images=some)).blamed == []
+    assert check_consistency(replace(capture, images=every)) == []
+
+
 def test_without_cameras_nothing_is_said(scene):
     capture, _ = scene
-    from dataclasses import replace
-
     assert check_consistency(replace(capture, cameras=None)) == []
 
 

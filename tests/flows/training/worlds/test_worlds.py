@@ -12,9 +12,8 @@ from safetensors.torch import load_file
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.synthetic.capture import look_at
-from cat3d_core.synthetic.tracer import Traced
+from cat3d_core.warp import warp
 from flows.errors import InputError
-from flows.training.evaluation import warp
 from flows.training.ranks import Ranks
 from flows.training.sweep import render_bank
 from flows.training.sweep_batches import GeometryBank
@@ -257,8 +256,7 @@ def test_groups_follow_from_their_key_and_depth_reprojects(studio: Studio) -> No
     distance = first.cameras.centers.norm(dim=-1)
     assert 0.3 < float(distance.mean()) < 3
     image, depth = first.image.float() / 255, 1 / first.inverse_depth
-    traced = Traced(image, depth, torch.zeros_like(image))
-    carried, seen = warp(traced, first.cameras, 1, [0])
+    carried, seen = warp([image[0]], [depth[0]], first.cameras[:1], first.cameras[1], depth[1])
     assert seen.float().mean() > 0.2
     error = (carried - image[1]).abs().mean(0)[seen]
     assert float(error.median()) < 0.03
