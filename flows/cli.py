@@ -19,6 +19,7 @@ from flows.cli_app import (
     SeedOption,
     SetOption,
     app,
+    on_a_file_system,
 )
 
 
@@ -177,16 +178,20 @@ def sweep(
     config: Annotated[str, typer.Argument(help="A sweep's YAML file, or the name of a shipped one (see --list).")] = "",
     out: OutOption = Path("outputs/sweep"),
     list_: Annotated[bool, typer.Option("--list", help="List the shipped sweeps.")] = False,
+    settings: Annotated[Path | None, typer.Option("--config", help="Settings of all runs from a file.")] = None,
+    set_: SetOption = None,
 ) -> None:
     """Benchmark sweep: scenes x training views x methods x seeds. Run again, it fills in what is missing."""
     from flows.commands.sweep import sweep_command
 
-    raise typer.Exit(sweep_command(config, out, list_))
+    raise typer.Exit(sweep_command(config, out, list_, settings, set_ or []))
 
 
 @app.command()
 def reprocess(
-    out: Annotated[Path, typer.Argument(help="The --out folder of an earlier run or sweep.")],
+    out: Annotated[
+        Path, typer.Argument(help="The --out folder of an earlier run or sweep.", callback=on_a_file_system)
+    ],
     split: Annotated[str | None, typer.Option(help="Only runs with these training views, e.g. 3.")] = None,
     from_: Annotated[str | None, typer.Option("--from", help="Redo this stage and all after it.")] = None,
     where: Annotated[

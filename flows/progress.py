@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 from collections.abc import Iterator
 
@@ -17,8 +18,8 @@ PLAIN_INTERVAL_S = 15.0
 class Meter:
     """Counts finished units of one piece of work. `note` is a short remark beside the bar (a loss, a view name)."""
 
-    def __init__(self, label: str, total: int, progress: Progress | None) -> None:
-        self.label, self.total, self.done = label, total, 0
+    def __init__(self, label: str, total: int, progress: Progress | None, quiet: bool = False) -> None:
+        self.label, self.total, self.done, self.note, self.quiet = label, total, 0, "", quiet
         self._progress = progress
         self._task = progress.add_task(label, total=total, note="") if progress else None
         self._started = self._spoke = time.monotonic()
@@ -27,28 +28,76 @@ class Meter:
         """Count finished units."""
         self.update(self.done + count, note)
 
+    def show(self, done: int, total: int, note: str = "") -> None:
+        """Show how far a worker is with the one unit that this is of."""
+        if self._progress is not None and self._task is not None:
+            self._progress.update(self._task, completed=done, total=total, note=note)
+
     def update(self, done: int, note: str = "") -> None:
         """Set the number of finished units."""
-        self.done = done
+        self.done, self.note = done, note
         if self._progress is not None and self._task is not None:
-            self._progress.update(self._task, completed=done, note=note)
-        elif time.monotonic() - self._spoke > PLAIN_INTERVAL_S:
+            self._progress.update(self._task, completed=done, total=self.total, note=note)
+        elif not self.quiet and time.monotonic() - self._spoke > PLAIN_INTERVAL_S:
             self._spoke = time.monotonic()
             elapsed = self._spoke - self._started
             left = elapsed / max(done, 1) * (self.total - done)
             text = f"  {self.label}: {done}/{self.total}, about {left:.0f} s left {note}"
             console.print(text, markup=False)
 
+    def end(self) -> None:
+        """Take it off the display."""
+        if self._progress is not None and self._task is not None:
+            self._progress.remove_task(self._task)
+
+
+class _Display:
+    """The one live display of this process: the meters of all threads, one below the other."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.meters: list[Meter] = []
+        self.progress: Progress | None = None
+
+    def begin(self, label: str, total: int, quiet: bool) -> Meter:
+        with self.lock:
+            if self.progress is None and console.is_terminal:
+                self.progress = Progress(
+                    TextColumn("  {task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
+                    TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.fields[note]}", markup=False),
+                    console=console, transient=True,
+                )  # fmt: skip
+                self.progress.start()
+            meter = Meter(label, total, self.progress, quiet)
+            self.meters.append(meter)
+            return meter
+
+    def end(self, meter: Meter) -> None:
+        with self.lock:
+            self.meters.remove(meter)
+            meter.end()
+            if not self.meters and self.progress is not None:
+                self.progress.stop()
+                self.progress = None
+
+
+_display = _Display()
+
+
+def latest_meter() -> Meter | None:
+    """The meter of what this process is at."""
+    meters = _display.meters
+    return meters[-1] if meters else None
+
 
 @contextlib.contextmanager
-def meter(label: str, total: int) -> Iterator[Meter]:
-    """A progress meter for `total` units of work, e.g. `with meter("render fox v3", 12) as m: m.advance()`."""
-    if not console.is_terminal:
-        yield Meter(label, total, None)
-        return
-    columns = (
-        TextColumn("  {task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        TimeRemainingColumn(), TextColumn("{task.fields[note]}", markup=False),
-    )  # fmt: skip
-    with Progress(*columns, console=console, transient=True) as progress:
-        yield Meter(label, total, progress)
+def meter(label: str, total: int, quiet: bool = False) -> Iterator[Meter]:
+    """A progress meter for `total` units of work, e.g. `with meter("render fox v3", 12) as m: m.advance()`.
+
+    quiet: without lines of its own where there is no terminal, as one for all the work around it says more.
+    """
+    made = _display.begin(label, total, quiet)
+    try:
+        yield made
+    finally:
+        _display.end(made)

@@ -23,7 +23,7 @@ from pydantic import (
 
 from schemas.errors import ConfigError
 from schemas.hints import HintsConfig
-from schemas.settings import spelled_out
+from schemas.settings import merged, spelled_out
 from schemas.skip import SkipConfig
 from schemas.strict import StrictModel as _Model
 
@@ -115,22 +115,22 @@ class SampleConfig(_Model):
 
 
 class ExecutionConfig(_Model):
-    """Where and how generated views are worked on. Nothing here changes a result beyond rounding."""
+    """Where and how the work is done. Nothing here changes a result beyond rounding."""
 
     executor: Literal["local", "dask"] = "local"
     """`local`: processes on this machine; `dask`: a Dask cluster, through prefect-dask."""
     workers: PositiveInt | None = None
     """Processes; None: one per GPU, or without GPUs one per `threads` CPU cores."""
     threads: PositiveInt = 1
-    """CPU threads of each worker."""
+    """CPU threads of each worker: with equal numbers results are equal bit for bit."""
     groups_at_once: PositiveInt = 1
     """Groups in one evaluation of the network. With 1 results are bit-identical however the work is shared out."""
     batch_seconds: PositiveFloat = 10.0
     """Groups are handed out in batches that take about this long, by what was measured so far."""
     timeout_s: PositiveFloat = 600.0
-    """A worker that finishes nothing for so long is given up and its work handed to another."""
+    """A worker that finishes nothing and gives no sign of life for so long is given up, its work handed to another."""
     attempts: PositiveInt = 3
-    """Workers that may die on one and the same group before the stage fails."""
+    """Workers that may die on one and the same group or stage before the stage fails."""
     dask_address: str | None = None
     """Scheduler of a running Dask cluster, e.g. tcp://10.0.0.1:8786."""
     dask_cluster: str | None = None
@@ -138,7 +138,8 @@ class ExecutionConfig(_Model):
     dask_options: dict[str, Any] = Field(default_factory=dict)
     """Keyword arguments of that class."""
     dask_resources: dict[str, NonNegativeFloat] = Field(default_factory=dict)
-    """Dask resources a batch occupies, e.g. {GPU: 1}; workers must be started with them."""
+    """Dask resources that work occupies, e.g. {GPU: 1}; workers must be started with them. GPU is not asked for by what
+    computes on none."""
 
 
 class ReconstructConfig(_Model):
@@ -231,8 +232,16 @@ class SweepConfig(_Model):
     seeds: tuple[Annotated[int, Field(ge=0)], ...] = (0,)
     base: dict[str, Any] = Field(default_factory=dict)
     """Settings of RunConfig for all runs."""
-    workers: PositiveInt = 1
-    """Scenes worked on at the same time."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _workers(cls, value: Any) -> Any:
+        """`workers: N` is short for `base: {execution: {workers: N}}`."""
+        if not isinstance(value, dict) or "workers" not in value:
+            return value
+        rest = {name: given for name, given in value.items() if name != "workers"}
+        base = rest.get("base") or {}
+        return rest | {"base": merged({"execution": {"workers": value["workers"]}}, base)}
 
 
 def load_config(path: str | Path, model: type[BaseModel] = RunConfig) -> Any:

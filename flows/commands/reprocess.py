@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import os
 import shutil
-import statistics
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,9 +21,10 @@ from rich.table import Table
 from flows.errors import InputError
 from flows.jobs.job import Job
 from flows.jobs.scene import Scene
+from flows.pipeline.costs import Costs
 from flows.pipeline.keys import Step, downstream, expected_steps, pending
+from flows.pipeline.side_by_side import Result
 from flows.progress import console
-from flows.reporting.summary import timing_rows
 from schemas.errors import StoreError
 from schemas.layout import SCENE_STAGES
 from schemas.scene_store import SceneStore
@@ -104,7 +104,7 @@ def find_stale(
 
 def print_stale(found: list[Stale], out: Path) -> float:
     """Print the table of what will be redone, why, and the cost expected from earlier timings; the total in seconds."""
-    costs = expected_costs(out)
+    costs = Costs(out)
     table = Table("scene", "run", "stage", "why", "expected (s)")
     total, shared = 0.0, set()
     for stale in found:
@@ -114,7 +114,7 @@ def print_stale(found: list[Stale], out: Path) -> float:
                 if once in shared:
                     continue
                 shared.add(once) if once else None
-                cost = costs.get((job.scene_id, name, step.stage), costs.get(("", "", step.stage)))
+                cost = costs.seconds(job, step.stage)
                 total += cost or 0.0
                 table.add_row(job.scene_id, name, step.stage, step.why, "unknown" if cost is None else f"{cost:.1f}")
     console.print(table)
@@ -122,37 +122,54 @@ def print_stale(found: list[Stale], out: Path) -> float:
     return total
 
 
-def expected_costs(out: Path) -> dict[tuple[str, str, str], float]:
-    """Seconds by (scene, run, stage): the last execution; under ("", "", stage) the median over all runs."""
-    costs: dict[tuple[str, str, str], float] = {}
-    every: dict[str, list[float]] = defaultdict(list)
-    for row in timing_rows(out):
-        for stage, seconds in row["stages"].items():
-            costs[row["scene_id"], row["run"], stage] = seconds
-            every[stage].append(seconds)
-    return costs | {("", "", stage): statistics.median(values) for stage, values in every.items()}
-
-
 def redo(found: list[Stale], from_stage: str | None = None) -> None:
-    """Redo what is stale, scene by scene, each in a clone that replaces the store when it is complete."""
+    """Redo what is stale, each scene in a clone that replaces the store when it is complete. Raises the first error,
+    when all else is done."""
     from flows.pipeline.scene import run_jobs
 
+    jobs: list[Job] = []
     for stale in found:
-        clone = clone_path(stale.store)
-        results = clone.with_name(f"{clone.name}-results")
-        fresh = not clone.exists()
-        if fresh:
-            shutil.rmtree(results, ignore_errors=True)
-            make_clone(stale.store, clone)
-        jobs = [job.model_copy(update={"store": clone, "results": results}) for job, _ in stale.runs.values()]
-        if from_stage and fresh:  # a clone that is there already had its records taken back before
-            store = SceneStore.open(clone, "r+")
-            for job in jobs:
-                store.invalidate(downstream(from_stage), job.run)
-        if jobs:
-            run_jobs(jobs)
-        publish(results, stale.store.parent)
-        replace_store(stale.store, clone)
+        jobs += cloned_jobs(stale, from_stage)
+    left = Counter(job.store_path for job in jobs)
+    failed: dict[Path, Exception] = {}
+
+    def finished(result: Result) -> None:
+        clone = result.job.store_path
+        left[clone] -= 1
+        if result.error is not None:
+            failed.setdefault(clone, result.error)
+        elif not left[clone] and clone not in failed:
+            put_in_place(clone)
+
+    for stale in found:
+        if clone_path(stale.store) not in left:  # of an earlier reprocessing, which was killed when all was done
+            put_in_place(clone_path(stale.store))
+    run_jobs(jobs, finished=finished, same_threads=len(jobs) > 1)
+    for error in failed.values():
+        raise error
+
+
+def cloned_jobs(stale: Stale, from_stage: str | None) -> list[Job]:
+    """The scene's jobs in a clone of its store, which is made where an earlier reprocessing left none."""
+    clone = clone_path(stale.store)
+    results = clone.with_name(f"{clone.name}-results")
+    fresh = not clone.exists()
+    if fresh:
+        shutil.rmtree(results, ignore_errors=True)
+        make_clone(stale.store, clone)
+    jobs = [job.model_copy(update={"store": clone, "results": results}) for job, _ in stale.runs.values()]
+    if from_stage and fresh:  # a clone that is there already had its records taken back before
+        store = SceneStore.open(clone, "r+")
+        for job in jobs:
+            store.invalidate(downstream(from_stage), job.run)
+    return jobs
+
+
+def put_in_place(clone: Path) -> None:
+    """The results of a scene that is complete take the old ones' place."""
+    store = clone.with_name(f"{clone.name.removeprefix('.').removesuffix('.reprocess')}.zarr")
+    publish(clone.with_name(f"{clone.name}-results"), store.parent)
+    replace_store(store, clone)
 
 
 def clone_path(store: Path) -> Path:

@@ -49,6 +49,17 @@ def available_memory() -> int | None:
     return None
 
 
+def total_memory() -> int | None:
+    """Bytes of main memory that this process may use: the machine's, or less where a cgroup (a container, a job of
+    SLURM) says so; None where the system doesn't say."""
+    limits = []
+    with contextlib.suppress(AttributeError, OSError, ValueError):
+        limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    with contextlib.suppress(OSError, ValueError), open("/sys/fs/cgroup/memory.max") as file:
+        limits.append(int(file.read()))
+    return min(limits, default=None)
+
+
 def visible_gpus() -> list[str]:
     """The GPUs this process may use, as CUDA_VISIBLE_DEVICES names them."""
     given = os.environ.get("CUDA_VISIBLE_DEVICES")

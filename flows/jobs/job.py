@@ -118,8 +118,10 @@ class SplitError(InputError):
 
 class Outcome(NamedTuple):
     """What a stage did: `work` counts (views, rays, ...); `decisions` say what was chosen, skipped or is wrong; `usage`
-    is that of other processes that had a share of the work."""
+    is that of other processes that had a share of the work; `waited` are the seconds in which no worker had time for
+    it, which are not the stage's."""
 
     work: dict[str, float] = {}
     decisions: list[Decision] = []
     usage: Usage = Usage()
+    waited: float = 0.0

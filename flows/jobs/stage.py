@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from flows.jobs.job import Job, Outcome
+from flows.jobs.needs import Needs
 from schemas.config import RunConfig
 from schemas.layout import SCENE_STAGES
 from schemas.scene_store import SceneStore
@@ -47,6 +48,8 @@ class Stage:
     wanted(job): whether the job has the stage at all.
     passing: its result serves the next stage alone, and may be another run's by then: not redone while that stage is
     done.
+    needs: what it asks of a worker. spreads: `execute` itself hands its items out to workers (`fan_out`), so that it is
+    done by the command; every other stage is done as a whole by one worker.
     """
 
     name: str
@@ -57,6 +60,8 @@ class Stage:
     inputs: Callable[[Job, Mapping[str, str]], dict[str, Any]] = _no_inputs
     wanted: Callable[[Job], bool] = _always
     passing: bool = False
+    needs: Needs = Needs()
+    spreads: bool = False
 
     @property
     def per(self) -> Literal["scene", "run"]:

@@ -48,7 +48,7 @@ def execute_stage(job: Job, step: Step) -> StageRecord:
         code_version=step.version,
         started_at=started_at,
         finished_at=now(),
-        seconds=time.monotonic() - started,
+        seconds=time.monotonic() - started - outcome.waited,
         work=outcome.work,
         decisions=outcome.decisions,
     )

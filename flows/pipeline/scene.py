@@ -1,4 +1,4 @@
-"""The flow of one scene: its stages as Prefect tasks, each run only where the store does not hold its result yet.
+"""A stage as a Prefect task, and the flow of one scene.
 
 Tasks get the job (paths and settings) and the step (the wanted content key); results stay in the store.
 """
@@ -13,9 +13,15 @@ from prefect.cache_policies import NO_CACHE
 from rich.markup import escape
 
 from flows.jobs.job import Job
-from flows.pipeline.keys import Step
-from flows.pipeline.runner import execute_stage, opened, run_missing
+from flows.pipeline.keys import Step, stage
+from flows.pipeline.prefect_records import Advance, claim, publish
+from flows.pipeline.runner import execute_stage
+from flows.pipeline.side_by_side import Result, do_jobs
+from flows.pipeline.stage_work import StageWork
 from flows.progress import console
+from flows.workers.fan_out import fan_out, pool_is_open
+from schemas.layout import SCENE_STAGES
+from schemas.scene_store import SceneStore
 from schemas.stages import StageRecord
 
 #: Trying again helps where the machine failed for a moment, not where the input or the mathematics is at fault.
@@ -28,25 +34,41 @@ def _worth_retrying(_task: Any, _run: Any, state: Any) -> bool:
 
 
 @task(retries=RETRIES, retry_delay_seconds=[1, 5], retry_condition_fn=_worth_retrying, cache_policy=NO_CACHE,
-      task_run_name="{step.stage} {job.scene_id}")  # fmt: skip
+      task_run_name="{step.stage} {job.scene_id} {job.run}")  # fmt: skip
 def run_stage(job: Job, step: Step) -> StageRecord:
-    """Run one stage of a job and record it. Returns the record, not the data."""
-    return execute_stage(job, step)
+    """Do one stage of a job: here, or where the command's workers are, as a whole on one of them or in batches on all.
+    Returns the record, not the data."""
+    if not pool_is_open() or stage(step.stage).spreads:
+        return execute_stage(job, step)
+    totals = fan_out([StageWork(job, step)], job.config.execution, f"{step.stage} {job.scene_id} {job.run}")
+    record = SceneStore.open(job.store_path).record(step.stage, job.run)
+    assert record is not None  # else the fan-out had raised
+    for decision in (*totals.decisions, *record.decisions):
+        console.print(f"  {decision.text}", style="dim", markup=False)
+    return record
+
+
+def perform(job: Job, step: Step) -> StageRecord:
+    """`run_stage` as a task that Prefect shows by scene, run and stage."""
+    console.print(f"[bold]{step.stage}[/bold] {job.scene_id} {job.run} ({escape(step.why)})")
+    tags = [step.stage, job.scene_id, *([] if step.stage in SCENE_STAGES else [job.run])]
+    record: StageRecord = run_stage.with_options(tags=tags)(job, step)
+    return record
 
 
 @flow(name="cat3d-scene", flow_run_name="{scene_id}", validate_parameters=False)
 def scene_flow(scene_id: str, jobs: Sequence[Job]) -> list[StageRecord]:
-    """All stages of all jobs of one scene that are not done yet, in order. Returns the records of what ran."""
-    return run_jobs(jobs)
+    """All stages of all jobs of one scene that are not done yet. Returns the records of what ran; raises the first
+    error, when what does not need that stage is done."""
+    results = run_jobs(jobs)
+    return [record for result in results for record in result.records_or_raise()]
 
 
-def run_jobs(jobs: Sequence[Job]) -> list[StageRecord]:
-    """What `scene_flow` does, inside whichever flow calls it: the jobs of one scene, each missing stage a task."""
-
-    def execute(job: Job, step: Step) -> StageRecord:
-        console.print(f"[bold]{step.stage}[/bold] {job.scene_id} {job.run} ({escape(step.why)})")
-        record: StageRecord = run_stage(job, step)
-        return record
-
-    with opened(jobs[0]):
-        return [record for job in jobs for record in run_missing(job, execute=execute)]
+def run_jobs(jobs: Sequence[Job], **options: Any) -> list[Result]:
+    """`do_jobs` with each missing stage a task of the flow that calls this, which shows how far it is and what came of
+    it."""
+    claim()
+    results = do_jobs(jobs, perform, advanced=Advance(jobs[0].out), **options) if jobs else []
+    if jobs:
+        publish(jobs[0].out)
+    return results

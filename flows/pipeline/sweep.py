@@ -99,7 +99,7 @@ def run_sweep(config: SweepConfig, out: Path) -> list[str]:
         from flows.pipeline.sweep_flow import sweep_flow
 
         with prefect_server(out / ".prefect"):
-            problems += sweep_flow(todo, config.workers)
+            problems += sweep_flow(config.name, [job for jobs in todo for job in jobs])
     (out / PROBLEMS).write_text(json.dumps(problems, indent=1))
     page = write_report(out, only_if_changed=not todo)
     console.print(f"Report: {page}")

@@ -45,12 +45,12 @@ from schemas.tables import TIMINGS, read_rows
 VIEWS_SHOWN = 3
 #: Scenes whose pictures stand at the top of the page, at most.
 SCENES_ON_TOP = 12
-SWEEP, PROBLEMS = "sweep.json", "problems.json"
+REPORT, SWEEP, PROBLEMS = "report.html", "sweep.json", "problems.json"
 
 
 def write_report(out: Path, only_if_changed: bool = False) -> Path:
     """Write report.html and report.md of the folder; returns the page. `only_if_changed` keeps a page that exists."""
-    page = out / "report.html"
+    page = out / REPORT
     if only_if_changed and page.exists():
         return page
     scenes = [scene_section(out, path) for path in sorted(out.glob("*.zarr"))]

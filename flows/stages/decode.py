@@ -14,12 +14,15 @@ from flows.generation.imported import Imported, imported
 from flows.generation.open import generator_spec, open_generator
 from flows.generation.views import finished
 from flows.jobs.job import Job, Outcome
+from flows.jobs.needs import Needs
 from flows.jobs.stage import Stage, generates
 from flows.media.images import to_uint8
 from flows.workers.fan_out import fan_out
-from flows.workers.work import Work, is_done
+from flows.workers.work import ViewMarks, ViewWork, is_done
 from schemas.decisions import chosen, skipped
 from schemas.scene_store import SceneStore
+
+NEEDS = Needs(gpu=True, memory_gb=1.5)
 
 
 def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
@@ -48,24 +51,13 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     text = f"Skipped decoding {len(left_out)} of {views} views: they were not sampled."
     decisions = [skipped(text, views=len(left_out))] if left_out else []
     each = [[view] for view in range(views)]
-    share = Work(
-        job,
-        "decode",
-        key,
-        open_generator,
-        work,
-        generated,
-        "done_image",
-        "image",
-        view_keys(key, views),
-        [wanted],
-        each,
-    )
+    marks = ViewMarks(generated, "done_image", "image", view_keys(key, views))
+    share = ViewWork(job, "decode", key, NEEDS, open_generator, work, marks, [wanted], each)
     missing = len(share.passes[0])
     label = f"decode {job.scene_id} {job.run}"
     totals = fan_out([share], job.config.execution, label, here=job.config.skip.workers)
     counts = {"views": missing, "evaluations": missing} | totals.work()
-    return Outcome(counts, decisions + totals.decisions, totals.usage)
+    return Outcome(counts, decisions + totals.decisions, totals.usage, totals.waited)
 
 
 def take_over(job: Job, store: SceneStore, key: str, found: Imported) -> Outcome:
@@ -102,4 +94,13 @@ def work(job: Job, store: SceneStore, key: str, items: Sequence[int]) -> None:
         generated.mark_done("done_image", [keys[view]], [view])
 
 
-STAGE = Stage("decode", execute, version=1, reads=("sample",), inputs=inputs, wanted=generates)
+STAGE = Stage(
+    "decode",
+    execute,
+    version=1,
+    reads=("sample",),
+    inputs=inputs,
+    wanted=generates,
+    needs=NEEDS,
+    spreads=True,
+)

@@ -14,6 +14,7 @@ from flows.generation.open import forget_generator, generator_spec, open_generat
 from flows.generation.views import captured_sample
 from flows.jobs.device import cpu_threads
 from flows.jobs.job import Job, Outcome
+from flows.jobs.needs import Needs
 from flows.jobs.stage import Stage
 from flows.progress import Meter, meter
 from schemas.content_key import content_key
@@ -57,4 +58,13 @@ def encode_views(job: Job, store: SceneStore, key: str, kind: str, views: list[i
     return len(missing)
 
 
-STAGE = Stage("encode", execute, version=1, reads=("poses",), inputs=inputs, wanted=samples, passing=True)
+STAGE = Stage(
+    "encode",
+    execute,
+    version=1,
+    reads=("poses",),
+    inputs=inputs,
+    wanted=samples,
+    passing=True,
+    needs=Needs(gpu=True, memory_gb=1.0),
+)

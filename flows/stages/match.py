@@ -20,6 +20,7 @@ from flows.generation.views import captured_sample
 from flows.jobs.access import read_cameras, views_with_role
 from flows.jobs.device import cpu_threads
 from flows.jobs.job import Job, Outcome
+from flows.jobs.needs import Needs
 from flows.jobs.stage import Stage
 from flows.media.images import to_uint8
 from flows.progress import meter
@@ -112,4 +113,6 @@ def wanted(job: Job) -> bool:
     return job.hinted and samples(job)
 
 
-STAGE = Stage("match", execute, version=1, reads=("plan",), inputs=inputs, wanted=wanted)
+STAGE = Stage(
+    "match", execute, version=1, reads=("plan",), inputs=inputs, wanted=wanted, needs=Needs(gpu=True, memory_gb=1.0)
+)

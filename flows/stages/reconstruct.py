@@ -10,6 +10,7 @@ from typing import Any
 from cat3d_core.reconstruction import Reconstructor
 from flows.jobs.device import exact_device
 from flows.jobs.job import Job, Outcome
+from flows.jobs.needs import Needs
 from flows.jobs.stage import Stage, settings_of
 from flows.progress import meter
 from flows.reconstruction.open import open_reconstructor
@@ -78,4 +79,5 @@ STAGE = Stage(
     reads=("poses", "decode"),
     settings=settings_of("reconstruct", "seed", unless={"method": "zipnerf"}),
     inputs=inputs,
+    needs=Needs(gpu=True, memory_gb=2.0),
 )

@@ -13,6 +13,7 @@ from cat3d_core.reconstruction import Reconstructor
 from cat3d_core.trajectories import RECIPES, Shift, choose_recipe, scene_frame
 from flows.jobs.access import read_cameras, views_with_role, write_cameras
 from flows.jobs.job import Job, Outcome
+from flows.jobs.needs import Needs
 from flows.jobs.stage import Stage, settings_of
 from flows.media import images
 from flows.media.pictures import depth_picture
@@ -133,4 +134,12 @@ def _depth_range(section: Section) -> tuple[float, float]:
     return tuple(np.quantile(inside, [0.01, 0.95]).tolist()) if inside.size else (0.1, 1.0)
 
 
-STAGE = Stage("render", execute, version=VERSION, reads=("reconstruct",), settings=settings_of("render"), inputs=inputs)
+STAGE = Stage(
+    "render",
+    execute,
+    version=VERSION,
+    reads=("reconstruct",),
+    settings=settings_of("render"),
+    inputs=inputs,
+    needs=Needs(gpu=True, memory_gb=1.0),
+)

@@ -20,15 +20,17 @@ from flows.generation.opening import opening
 from flows.generation.rounds import OneRound, Rounds
 from flows.generation.sampling import sampler_config, sampler_settings
 from flows.jobs.job import Job, Outcome
+from flows.jobs.needs import Needs
 from flows.jobs.stage import Stage, settings_of
 from flows.workers.fan_out import Totals, fan_out
-from flows.workers.work import Work, is_done
+from flows.workers.work import ViewMarks, ViewWork, is_done
 from schemas.decisions import Decision, chosen, skipped
 from schemas.scene_store import SceneStore
 
 #: `skip.near_steps`: mean pose distance (scene distances, about radians of turning) from a group's views to the nearest
 #: captured view below which the group takes half of the steps.
 NEAR = 0.25
+NEEDS = Needs(gpu=True, memory_gb=1.5)
 
 
 def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
@@ -79,10 +81,10 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     counts = {"views": sum(len(plan.groups[g].targets) for g in groups), "groups": len(groups)}
     spent = sum(group_cost(job, plan.groups[g], c).evaluations for g, c in zip(groups, configs, strict=True))
     counts |= {"steps": sum(c.steps for c in configs), "evaluations": spent}
-    return Outcome(counts | totals.work(), decisions, totals.usage)
+    return Outcome(counts | totals.work(), decisions, totals.usage, totals.waited)
 
 
-def sample_work(job: Job, store: SceneStore, key: str, passes: Sequence[Sequence[int]] | None = None) -> Work:
+def sample_work(job: Job, store: SceneStore, key: str, passes: Sequence[Sequence[int]] | None = None) -> ViewWork:
     """The groups that are to be sampled: anchors first, then all others, or those of `passes`. Makes room for the
     latents."""
     run = store.run(job.run)
@@ -91,7 +93,8 @@ def sample_work(job: Job, store: SceneStore, key: str, passes: Sequence[Sequence
     run.generated.create_array("done_latent", (len(plan), 32))
     targets = [group.targets for group in plan.groups]
     keys, passes = view_keys(key, len(plan)), plan.passes() if passes is None else passes
-    return Work(job, "sample", key, open_generator, work, run.generated, "done_latent", "latent", keys, passes, targets)
+    views = ViewMarks(run.generated, "done_latent", "latent", keys)
+    return ViewWork(job, "sample", key, NEEDS, open_generator, work, views, passes, targets)
 
 
 def group_sampler(job: Job, plan: StoredPlan, group: Group) -> SamplerConfig:
@@ -172,4 +175,6 @@ STAGE = Stage(
     settings=settings_of("sample", "seed", without=("generator", "checkpoint")),  # its identity is among the inputs
     inputs=inputs,
     wanted=samples,
+    needs=NEEDS,
+    spreads=True,
 )

@@ -11,6 +11,8 @@ import importlib
 import logging
 import os
 import queue
+import time
+from collections import Counter
 from typing import Any
 
 import distributed
@@ -21,6 +23,7 @@ from prefect.cache_policies import NO_CACHE
 from prefect_dask.client import PrefectDaskClient
 
 from flows.jobs.device import worker_count
+from flows.jobs.needs import Needs
 from flows.workers.work import Answer, Batch, run_batch
 from schemas.config import ExecutionConfig
 from schemas.errors import ConfigError
@@ -30,6 +33,8 @@ os.environ.setdefault("DASK_LOGGING__DISTRIBUTED", "critical")
 logging.getLogger("distributed").setLevel(logging.CRITICAL)
 
 RESTART_TIMEOUT_S = 5
+LOOK_S = 1.0  # how old what is known of the workers may be
+NO_BATCH = -1
 ANSWER_TIMEOUT_S = 30  # for a line of JSON from the worker that finished; one that stopped since never sends it
 
 
@@ -43,40 +48,74 @@ def dask_batch(document: str, label: str) -> str:
 
 
 class DaskExecutor:
-    """A cluster of its own, or a running one. Dask itself gives a dead worker's batch to another worker."""
+    """A cluster of its own, or a running one. Dask itself gives a dead worker's batch to another worker.
 
-    ahead = 1  # a task's way through Prefect and Dask takes 0.1 s and more, see docs/explanation/scaling.md
+    Work without a GPU may go to any worker, so that a cluster can have cheaper ones for it; work with one goes to those
+    that have the resources of the settings. Workers whose memory is too small for a batch are passed over.
+    """
 
     def __init__(self, settings: ExecutionConfig) -> None:
         self.resources = dict(settings.dask_resources)
         self.exclusive = settings.dask_address is None
         self.cluster = None if settings.dask_address else make_cluster(settings)
         self.client = PrefectDaskClient(settings.dask_address or self.cluster, set_as_default=False)
-        if self.cluster is None:
-            self.client.wait_for_workers(1, timeout=settings.timeout_s)
+        self.looked, self.known = -LOOK_S, dict[str, Any]()
+        self.able: dict[Needs, frozenset[str]] = {}
         self.futures: dict[int, distributed.Future] = {}
         self.finished: queue.SimpleQueue[int] = queue.SimpleQueue()  # numbers of batches
 
-    def workers(self) -> int:
-        """Those that have the resources; at least one, as a cluster may only be starting."""
-        known = self.client.scheduler_info(n_workers=-1)["workers"].values()
-        able = [w for w in known if all(w["resources"].get(n, 0) >= v for n, v in self.resources.items())]
-        return max(1, len(able))
+    def workers(self, needs: Needs) -> int:
+        return len(self._able(needs))
+
+    def room(self, needs: Needs, out: Counter[Needs]) -> int:
+        """Workers that can do it and have none of the batches that are out, as far as what those need tells."""
+        able = self._able(needs)
+        narrower = sum(count for other, count in out.items() if self._able(other) <= able)
+        return min(len(able) - narrower, len(self.known) - out.total())
+
+    def _able(self, needs: Needs) -> frozenset[str]:
+        """Addresses of the workers that have what such work needs."""
+        if time.monotonic() - self.looked > LOOK_S:
+            self.looked = time.monotonic()
+            self.known = self.client.scheduler_info(n_workers=-1)["workers"]
+            self.able = {}
+        if needs not in self.able:
+            resources = self._resources(needs)
+            self.able[needs] = frozenset(
+                address
+                for address, worker in self.known.items()
+                if all(worker["resources"].get(name, 0) >= value for name, value in resources.items())
+                and not 0 < worker["memory_limit"] < needs.memory_gb * 1e9
+            )
+        return self.able[needs]
+
+    def _places(self, needs: Needs) -> list[str] | None:
+        """Addresses that the batch is kept to; None where its resources say enough."""
+        able = self._able(needs)
+        return None if able == self._able(needs.model_copy(update={"memory_gb": 0.0})) else sorted(able)
+
+    def _resources(self, needs: Needs) -> dict[str, float]:
+        """What a batch occupies of a worker: as set, but no GPU where it computes on none."""
+        return {name: value for name, value in self.resources.items() if needs.gpu or name != "GPU"}
 
     def submit(self, batch: Batch) -> None:
-        label = f"{batch.stage} {batch.job.scene_id} {batch.number}"
+        label = f"{batch.stage} {batch.job.scene_id} {batch.job.run} {batch.number}"
         future = self.client.submit(
-            dask_batch, batch.model_dump_json(), label, resources=self.resources or None, pure=False
-        )
+            dask_batch, batch.model_dump_json(), label, resources=self._resources(batch.needs) or None,
+            workers=self._places(batch.needs), pure=False,
+        )  # fmt: skip
         self.futures[batch.number] = future
         future.add_done_callback(lambda _: self.finished.put(batch.number))
+
+    def wake(self) -> None:
+        self.finished.put(NO_BATCH)
 
     def answers(self, timeout_s: float) -> list[Answer]:
         out = []
         with contextlib.suppress(queue.Empty):
             number = self.finished.get(timeout=timeout_s)
             while True:
-                if number in self.futures:  # else it was taken back
+                if number in self.futures:  # else it was taken back, or is NO_BATCH
                     out.append(_answer(number, self.futures.pop(number)))
                 number = self.finished.get_nowait()
         return out
@@ -117,8 +156,8 @@ def make_cluster(settings: ExecutionConfig) -> Any:
             f"execution.dask_cluster: there is no {settings.dask_cluster} here; install its package or correct it."
         ) from None
     cluster = kind(**settings.dask_options)
-    if settings.workers:
-        cluster.scale(settings.workers)
+    if settings.workers:  # not `scale`: jobs that a batch system ends, as at their time limit, are to be replaced
+        cluster.adapt(minimum=settings.workers, maximum=settings.workers)
     return cluster
 
 

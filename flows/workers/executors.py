@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Protocol
 
+from flows.jobs.needs import Needs
 from flows.workers.work import Answer, Batch
 from schemas.config import ExecutionConfig
 
@@ -12,19 +14,25 @@ from schemas.config import ExecutionConfig
 class Executor(Protocol):
     """Workers that do one batch at a time.
 
-    ahead: batches that may wait for each worker while it is busy, where handing one out takes long.
     exclusive: after `close`, none of the workers can be writing any more.
     """
 
-    ahead: int
     exclusive: bool
 
-    def workers(self) -> int:
-        """Batches that can be worked on at once, as of now."""
+    def workers(self, needs: Needs) -> int:
+        """Workers that such work can be done on, as of now; 0 while a cluster has none of them."""
+        ...
+
+    def room(self, needs: Needs, out: Counter[Needs]) -> int:
+        """How many more batches with these needs may be handed out, while as many as `out` says are."""
         ...
 
     def submit(self, batch: Batch) -> None:
-        """Hand a batch out; only while fewer than workers() * (1 + ahead) are out."""
+        """Hand a batch out; only where there is room."""
+        ...
+
+    def wake(self) -> None:
+        """End the wait in `answers` now; called from another thread."""
         ...
 
     def answers(self, timeout_s: float) -> list[Answer]:

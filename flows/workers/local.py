@@ -8,10 +8,12 @@ import selectors
 import signal
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import BinaryIO, cast
 
-from flows.jobs.device import visible_gpus, worker_count
+from flows.jobs.device import total_memory, visible_gpus, worker_count
+from flows.jobs.needs import Needs
 from flows.workers.work import Answer, Batch
 from schemas.config import ExecutionConfig
 
@@ -19,7 +21,6 @@ from schemas.config import ExecutionConfig
 class LocalExecutor:
     """Starts workers as they are needed, and new ones for those that die. Batches and answers are lines of JSON."""
 
-    ahead = 0  # a line of JSON is there at once
     exclusive = True
 
     def __init__(self, settings: ExecutionConfig, log_folder: Path) -> None:
@@ -28,11 +29,27 @@ class LocalExecutor:
         self.threads = settings.threads
         self.log_folder = log_folder
         self.running: dict[int, _Worker] = {}  # by place, 0 to count - 1
+        memory = total_memory()
+        self.memory_gb = None if memory is None else memory / 1e9
         self.selector = selectors.DefaultSelector()
+        self.rung, self.bell = os.pipe()  # what `wake` writes to ends the selector's wait
+        self.selector.register(self.rung, selectors.EVENT_READ, None)
         log_folder.mkdir(parents=True, exist_ok=True)
 
-    def workers(self) -> int:
+    def workers(self, needs: Needs) -> int:
         return self.count
+
+    def room(self, needs: Needs, out: Counter[Needs]) -> int:
+        """Places that are free, as long as memory is; one batch is always let in."""
+        places = self.count - out.total()
+        if self.memory_gb is None or not out:
+            return places
+        free = self.memory_gb - sum(other.memory_gb * count for other, count in out.items())
+        return min(places, int(free / max(needs.memory_gb, 1e-3)))
+
+    def wake(self) -> None:
+        with contextlib.suppress(OSError):  # closed meanwhile
+            os.write(self.bell, b"!")
 
     def submit(self, batch: Batch) -> None:
         idle = [w for w in self.running.values() if w.batch is None]
@@ -45,6 +62,9 @@ class LocalExecutor:
     def answers(self, timeout_s: float) -> list[Answer]:
         out = []
         for ready, _ in self.selector.select(timeout_s):
+            if ready.data is None:
+                os.read(self.rung, 4096)
+                continue
             worker: _Worker = ready.data
             line = worker.stdout.readline()
             if line.endswith(b"\n"):
@@ -66,6 +86,8 @@ class LocalExecutor:
         for worker in list(self.running.values()):
             self._end(worker)
         self.selector.close()
+        os.close(self.bell)
+        os.close(self.rung)
 
     def _start(self, place: int) -> _Worker:
         environment = os.environ | {"OMP_NUM_THREADS": str(self.threads), "MKL_NUM_THREADS": str(self.threads)}

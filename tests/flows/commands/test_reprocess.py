@@ -15,10 +15,11 @@ import torch
 from typer.testing import CliRunner
 
 from flows.cli import app
-from flows.commands.reprocess import clone_path, expected_costs, find_stale, make_clone, recover, redo, replace_store
+from flows.commands.reprocess import clone_path, find_stale, make_clone, recover, redo, replace_store
 from flows.errors import InputError
 from flows.jobs.metric_table import metric_table
 from flows.media import images
+from flows.pipeline.costs import Costs
 from flows.pipeline.sweep import run_sweep
 from flows.reporting.summary import timing_rows
 from flows.stages import STAGES, render
@@ -234,12 +235,16 @@ def test_dry_run_prints_what_why_and_the_cost_expected_from_earlier_timings(root
 
 
 def test_expected_costs_are_the_runs_own_and_for_new_ones_the_median(finished: Path) -> None:
-    costs = expected_costs(finished / "out")
+    costs = Costs(finished / "out")
     timings = {t["run"]: t["stages"] for t in timing_rows(finished / "out")}
     for run, stages in timings.items():
-        assert {s: costs["room", run, s] for s in stages} == stages
+        assert {s: costs.own["room", run, s] for s in stages} == stages
     values = sorted(t["sample"] for t in timings.values() if "sample" in t)
-    assert costs["", "", "sample"] == pytest.approx(sum(values) / 2)
+    [stale] = find_stale(finished / "out", where={"run": "v3-*"}, from_stage="render")[0]
+    job = next(iter(stale.runs.values()))[0]
+    new = job.model_copy(update={"config": job.config.model_copy(update={"label": "new"})})
+    assert costs.seconds(new, "sample") == pytest.approx(sum(values) / 2)
+    assert costs.seconds(new, "no stage") is None
 
 
 def test_clip_weights_make_only_the_evaluation_stale(root: Path, monkeypatch, prefect_url: str) -> None:

@@ -13,10 +13,11 @@ from flows.jobs.job import Job
 from flows.pipeline.keys import Step, downstream, expected_steps
 from flows.stages import sample as sample_stage
 from flows.stages.sample import sample_work
-from flows.workers import fan_out as fan_out_module
 from flows.workers.executors import open_executor
 from flows.workers.fan_out import fan_out
+from flows.workers.sharing import batch_size
 from flows.workers.work import Answer, Batch, run_batch
+from schemas.config import ExecutionConfig
 from schemas.errors import StoreError
 from schemas.scene_store import SceneStore
 from tests.flows.workers.scene import chunk_times, run_of, run_stages
@@ -211,16 +212,13 @@ def test_noise_depends_on_scene_seed_and_view_alone(scene) -> None:
     assert not torch.equal(plan.noise(a, (8, 8, 8)), other.noise(a, (8, 8, 8)))
 
 
-def test_batches_last_about_as_long_as_asked_and_shrink_towards_the_end(scene) -> None:
-    job = scene(batch_seconds=10)
-    sharing = fan_out_module._Sharing([], None, job.config.execution, None)  # type: ignore[arg-type]
-    assert sharing._batch_size(1000, 4) == 1, "the first ones measure"
-    sharing.item_seconds = 2.0
-    assert sharing._batch_size(1000, 4) == 5
-    assert sharing._batch_size(16, 4) == 2
-    assert sharing._batch_size(3, 4) == 1
-    sharing.item_seconds = 60.0
-    assert sharing._batch_size(1000, 4) == 1
+def test_batches_last_about_as_long_as_asked_and_shrink_towards_the_end() -> None:
+    settings = ExecutionConfig(batch_seconds=10)
+    assert batch_size(settings, None, 1000, 4) == 1, "the first ones measure"
+    assert batch_size(settings, 2.0, 1000, 4) == 5
+    assert batch_size(settings, 2.0, 16, 4) == 2
+    assert batch_size(settings, 2.0, 3, 4) == 1
+    assert batch_size(settings, 60.0, 1000, 4) == 1
 
 
 def test_a_workers_error_keeps_its_type_and_names_its_cause(scene) -> None:

@@ -1,0 +1,281 @@
+"""Which batch goes to which worker next, what is taken back from dead and hanging workers, and progress.
+
+The store says what is done; a worker's answer only says that it is free again. So nothing depends on who did what.
+"""
+
+from __future__ import annotations
+
+import math
+import queue
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+from flows.errors import WorkerError
+from flows.jobs.job import Job
+from flows.jobs.needs import Needs
+from flows.jobs.usage import Usage
+from flows.progress import Meter, console
+from flows.workers.executors import Executor
+from flows.workers.work import Answer, Batch, Sign, Work
+from schemas.config import ExecutionConfig
+from schemas.decisions import Decision, warning
+
+POLL_S = 1.0
+#: Looking at the store for progress takes at most this share of the time, however many batches are out.
+WATCHING_SHARE = 0.05
+#: How often it is said that there is no worker yet.
+SAY_S = 60.0
+
+
+@dataclass
+class Totals:
+    """What a fan-out did. busy_seconds: workers' time on batches, without loading_seconds (the model's); waited:
+    seconds in which no worker had time for it."""
+
+    workers: int = 0
+    batches: int = 0
+    busy_seconds: float = 0.0
+    loading_seconds: float = 0.0
+    waited: float = 0.0
+    decisions: list[Decision] = field(default_factory=list)
+    usage: Usage = field(default_factory=Usage)
+
+    def __add__(self, other: Totals) -> Totals:
+        summed = {n: getattr(self, n) + getattr(other, n) for n in vars(self) if n not in ("workers", "usage")}
+        return Totals(max(self.workers, other.workers), **summed, usage=self.usage.with_(other.usage))
+
+    def work(self) -> dict[str, float]:
+        """Counts for the stage's record."""
+        counts = ("workers", "batches", "busy_seconds", "loading_seconds")
+        return {name: getattr(self, name) for name in counts if self.workers}
+
+
+class Order:
+    """Works that are wanted done together, of one run or of many. over: nothing of them is left or under way."""
+
+    def __init__(self, works: Sequence[Work], settings: ExecutionConfig, progress: Meter) -> None:
+        self.works, self.settings, self.progress = works, settings, progress
+        self.passes = [deque(deque(items) for items in work.passes if items) for work in works]
+        self.out: Counter[int] = Counter()  # batches that workers have, by number of the work
+        self.deaths: Counter[tuple[int, int]] = Counter()
+        self.totals = Totals()
+        self.error: Exception | None = None
+        self.over = threading.Event()
+        self.idle_since: float | None = time.monotonic()
+
+    def ready(self, w: int) -> deque[int]:
+        """Items of work w that can be handed out now: a pass begins when the one before it is done."""
+        passes = self.passes[w]
+        if passes and not passes[0] and not self.out[w]:
+            passes.popleft()
+        return passes[0] if passes else deque()
+
+    def fail(self, error: Exception) -> None:
+        """Hand out nothing more; the first error is the one that is raised."""
+        self.error = self.error or error
+        self.passes = [deque() for _ in self.works]
+
+    def settle(self) -> None:
+        """Note whether workers have something of it, and whether it is over."""
+        if self.out.total():
+            if self.idle_since is not None:
+                self.totals.waited += time.monotonic() - self.idle_since
+                self.idle_since = None
+            return
+        self.idle_since = self.idle_since or time.monotonic()
+        if not any(self.ready(w) for w in range(len(self.works))):
+            self.over.set()
+
+
+@dataclass
+class _Out:
+    """A batch that a worker has: the items it hasn't finished yet, and when it last showed that it is at work."""
+
+    order: Order
+    w: int
+    batch: Batch
+    left: deque[int]
+    seen: float
+    sign: Sign | None = None
+
+    @property
+    def work(self) -> Work:
+        return self.order.works[self.w]
+
+
+def _no_priority(_job: Job) -> float:
+    return 0.0
+
+
+class Sharing:
+    """Orders shared out over the workers of an executor. One thread runs it; others may place orders meanwhile.
+
+    priority(job): orders of the job with the highest are served first.
+    """
+
+    def __init__(self, executor: Executor, priority: Callable[[Job], float] = _no_priority) -> None:
+        self.executor, self.priority = executor, priority
+        self.incoming: queue.SimpleQueue[Order] = queue.SimpleQueue()
+        self.orders: list[Order] = []
+        self.out: dict[int, _Out] = {}
+        self.needs: Counter[Needs] = Counter()  # of the batches that are out
+        self.item_seconds: dict[str, float] = {}  # by stage
+        self.number = 0
+        self.most_workers = 1  # so far
+        self.next_watch = self.next_say = 0.0
+        self.stopped = False
+
+    def place(self, order: Order) -> None:
+        """Take an order in, from any thread; its event `over` says when it is done."""
+        self.incoming.put(order)
+        self.executor.wake()
+        if self.stopped:
+            self.stop()
+
+    def run(self, over: Callable[[], bool]) -> None:
+        """Serve orders until `over()`, which is asked after every change."""
+        while not over():
+            while not self.incoming.empty():
+                self.orders.append(self.incoming.get())
+            self._hand_out()
+            self._settle_orders()
+            if over():
+                return
+            for answer in self.executor.answers(POLL_S):
+                self._settle(answer)
+            self._settle_orders()
+            self._watch()
+
+    def stop(self) -> None:
+        """Let everyone go who waits for an order."""
+        self.stopped = True
+        while not self.incoming.empty():
+            self.orders.append(self.incoming.get())
+        for order in self.orders:
+            order.fail(WorkerError("The work was stopped; run the same command again to go on."))
+            order.over.set()
+
+    def _settle_orders(self) -> None:
+        for order in self.orders:
+            order.settle()
+        self.orders = [order for order in self.orders if not order.over.is_set()]
+
+    def _waiting(self) -> Iterator[tuple[Order, int]]:
+        """Works with items to hand out: the highest priority first, then those with most passes left, as their later
+        passes wait for this one."""
+        ready = [(order, w) for order in self.orders for w in range(len(order.works)) if order.ready(w)]
+        ranks = {id(order): (-self.priority(order.works[0].job), i) for i, order in enumerate(self.orders)}
+        yield from sorted(ready, key=lambda one: (ranks[id(one[0])], -len(one[0].passes[one[1]]), one[1]))
+
+    def _hand_out(self) -> None:
+        full: set[Needs] = set()
+        for order, w in self._waiting():
+            work, items = order.works[w], order.ready(w)
+            while items and work.needs not in full:
+                if self.executor.room(work.needs, self.needs) < 1:
+                    full.add(work.needs)
+                    break
+                workers = self.executor.workers(work.needs)
+                order.totals.workers = max(order.totals.workers, workers)
+                self.most_workers = max(self.most_workers, workers)
+                size = batch_size(order.settings, self.item_seconds.get(work.stage), len(items), workers)
+                self.number += 1
+                batch = work.batch(self.number, [items.popleft() for _ in range(size)])
+                self.out[self.number] = _Out(order, w, batch, deque(batch.items), time.monotonic())
+                order.out[w] += 1
+                self.needs[work.needs] += 1
+                self.executor.submit(batch)
+        if full and not self.out and time.monotonic() > self.next_say:
+            self.next_say = time.monotonic() + SAY_S
+            console.print("Waiting for workers: the cluster has none yet that these stages can run on.")
+
+    def _taken(self, number: int) -> _Out | None:
+        """The batch is no longer out; None where it was given up on before."""
+        out = self.out.pop(number, None)
+        if out is not None:
+            out.order.out[out.w] -= 1
+            self.needs[out.work.needs] -= 1
+            self.needs += Counter()  # without those of which none is out
+        return out
+
+    def _settle(self, answer: Answer) -> None:
+        out = self._taken(answer.number)
+        if out is None:
+            return
+        if answer.died:
+            self._reclaim(out, answer.died)
+            return
+        try:
+            answer.raise_error()
+        except Exception as error:
+            out.order.fail(error)
+            return
+        totals = out.order.totals
+        totals.batches += 1
+        totals.busy_seconds += answer.seconds
+        totals.loading_seconds += answer.loading_seconds
+        totals.usage = totals.usage.with_(answer.usage)
+        self.item_seconds[out.work.stage] = answer.seconds / len(out.batch.items)
+        _advance(out, len(out.left))
+
+    def _watch(self) -> None:
+        """See in the store what is finished; take work back from workers that finish nothing any more."""
+        started = time.monotonic()
+        if started < self.next_watch:
+            return
+        for number, out in list(self.out.items()):
+            if number not in self.out:
+                continue
+            while out.left and out.work.finished(out.left[0]):
+                _advance(out, 1)
+            sign = out.work.sign(out.left[0]) if out.left else None
+            if sign is not None and sign != out.sign:
+                out.sign, out.seen = sign, time.monotonic()
+                out.order.progress.show(sign.done, sign.total, sign.note)
+            if not self.executor.workers(out.work.needs):  # all are gone: it waits for new ones
+                out.seen = time.monotonic()
+            if time.monotonic() - out.seen > out.order.settings.timeout_s:
+                for other in self.executor.take_back(out.batch):
+                    self.out[other].seen = time.monotonic()
+                self._taken(number)
+                self._reclaim(out, f"finished nothing for {out.order.settings.timeout_s:g} s")
+        ended = time.monotonic()
+        self.next_watch = ended + max(POLL_S, (ended - started) / WATCHING_SHARE)
+
+    def _reclaim(self, out: _Out, why: str) -> None:
+        """Put what a lost worker left undone first in the queue again."""
+        work, order = out.work, out.order
+        undone = [i for i in out.left if not work.finished(i)]
+        order.progress.advance(work.size(set(out.left) - set(undone)))
+        sentence = f"A worker {why}; its {len(undone)} unfinished items of {work.stage} were handed to another."
+        order.totals.decisions.append(warning(sentence))
+        if not undone or order.error:
+            return
+        culprit = out.w, undone[0]
+        order.deaths[culprit] += 1
+        if order.deaths[culprit] >= order.settings.attempts:
+            order.fail(WorkerError(
+                f"{order.deaths[culprit]} workers were lost on item {undone[0]} of {work.stage} of {work.job.scene_id} "
+                f"{work.job.run} (the last one {why}). What is done is kept; the workers' logs are in "
+                f"{work.job.out / '.work'}."
+            ))  # fmt: skip
+            return
+        order.passes[out.w][0].extendleft(reversed(undone))
+
+
+def _advance(out: _Out, count: int) -> None:
+    out.order.progress.advance(out.work.size([out.left.popleft() for _ in range(count)]))
+    out.seen = time.monotonic()
+
+
+def batch_size(settings: ExecutionConfig, item_seconds: float | None, waiting: int, workers: int) -> int:
+    """Items of about batch_seconds, but fewer near the end, so that workers end together. item_seconds: None where none
+    was measured yet."""
+    least = settings.groups_at_once
+    if item_seconds is None:
+        return min(waiting, least)
+    timely = int(settings.batch_seconds / max(item_seconds, 1e-9))
+    return min(waiting, max(least, min(timely, math.ceil(waiting / (2 * max(1, workers))))))
