@@ -85,6 +85,11 @@ def _lives(pid: int, since: datetime | None) -> bool:
     return since is None or began <= since.timestamp()
 
 
+def is_deployed() -> bool:
+    """Whether a Prefect worker started this process for a run of a deployment."""
+    return "PREFECT__FLOW_RUN_ID" in os.environ
+
+
 def publish(out: Path) -> None:
     """Artifacts of an output folder: its table of metrics, and the link to its report."""
     rows = summary_rows(out)

@@ -14,7 +14,7 @@ from rich.markup import escape
 
 from flows.jobs.job import Job
 from flows.pipeline.keys import Step, stage
-from flows.pipeline.prefect_records import Advance, claim, publish
+from flows.pipeline.prefect_records import Advance, claim, is_deployed, publish
 from flows.pipeline.runner import execute_stage
 from flows.pipeline.side_by_side import Result, do_jobs
 from flows.pipeline.stage_work import StageWork
@@ -65,10 +65,11 @@ def scene_flow(scene_id: str, jobs: Sequence[Job]) -> list[StageRecord]:
 
 
 def run_jobs(jobs: Sequence[Job], **options: Any) -> list[Result]:
-    """`do_jobs` with each missing stage a task of the flow that calls this, which shows how far it is and what came of
-    it."""
+    """`do_jobs` with each missing stage a task of the flow that calls this; a deployment's shows how far it is and what
+    came of it."""
     claim()
-    results = do_jobs(jobs, perform, advanced=Advance(jobs[0].out), **options) if jobs else []
-    if jobs:
-        publish(jobs[0].out)
+    if not jobs or not is_deployed():
+        return do_jobs(jobs, perform, **options)
+    results = do_jobs(jobs, perform, advanced=Advance(jobs[0].out), **options)
+    publish(jobs[0].out)
     return results

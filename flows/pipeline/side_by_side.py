@@ -120,7 +120,7 @@ class _Doing:
         except Exception as error:
             result.error = error
         self.outlook.over(job)
-        if self.finished is not None:
+        if self.finished is not None and not (self.pool is not None and self.pool.stopped):
             with self.telling:
                 self.finished(result)
         return result

@@ -26,6 +26,7 @@ from schemas.decisions import Decision, warning
 POLL_S = 1.0
 #: Looking at the store for progress takes at most this share of the time, however many batches are out.
 WATCHING_SHARE = 0.05
+Clock = Callable[[], float]
 #: How often it is said that there is no worker yet.
 SAY_S = 60.0
 
@@ -56,15 +57,17 @@ class Totals:
 class Order:
     """Works that are wanted done together, of one run or of many. over: nothing of them is left or under way."""
 
-    def __init__(self, works: Sequence[Work], settings: ExecutionConfig, progress: Meter) -> None:
-        self.works, self.settings, self.progress = works, settings, progress
+    def __init__(
+        self, works: Sequence[Work], settings: ExecutionConfig, progress: Meter, clock: Clock = time.monotonic
+    ) -> None:
+        self.works, self.settings, self.progress, self.clock = works, settings, progress, clock
         self.passes = [deque(deque(items) for items in work.passes if items) for work in works]
         self.out: Counter[int] = Counter()  # batches that workers have, by number of the work
         self.deaths: Counter[tuple[int, int]] = Counter()
         self.totals = Totals()
         self.error: Exception | None = None
         self.over = threading.Event()
-        self.idle_since: float | None = time.monotonic()
+        self.idle_since: float | None = clock()
 
     def ready(self, w: int) -> deque[int]:
         """Items of work w that can be handed out now: a pass begins when the one before it is done."""
@@ -82,10 +85,10 @@ class Order:
         """Note whether workers have something of it, and whether it is over."""
         if self.out.total():
             if self.idle_since is not None:
-                self.totals.waited += time.monotonic() - self.idle_since
+                self.totals.waited += self.clock() - self.idle_since
                 self.idle_since = None
             return
-        self.idle_since = self.idle_since or time.monotonic()
+        self.idle_since = self.idle_since or self.clock()
         if not any(self.ready(w) for w in range(len(self.works))):
             self.over.set()
 
@@ -116,8 +119,10 @@ class Sharing:
     priority(job): orders of the job with the highest are served first.
     """
 
-    def __init__(self, executor: Executor, priority: Callable[[Job], float] = _no_priority) -> None:
-        self.executor, self.priority = executor, priority
+    def __init__(
+        self, executor: Executor, priority: Callable[[Job], float] = _no_priority, clock: Clock = time.monotonic
+    ) -> None:
+        self.executor, self.priority, self.clock = executor, priority, clock
         self.incoming: queue.SimpleQueue[Order] = queue.SimpleQueue()
         self.orders: list[Order] = []
         self.out: dict[int, _Out] = {}
@@ -184,12 +189,12 @@ class Sharing:
                 size = batch_size(order.settings, self.item_seconds.get(work.stage), len(items), workers)
                 self.number += 1
                 batch = work.batch(self.number, [items.popleft() for _ in range(size)])
-                self.out[self.number] = _Out(order, w, batch, deque(batch.items), time.monotonic())
+                self.out[self.number] = _Out(order, w, batch, deque(batch.items), self.clock())
                 order.out[w] += 1
                 self.needs[work.needs] += 1
                 self.executor.submit(batch)
-        if full and not self.out and time.monotonic() > self.next_say:
-            self.next_say = time.monotonic() + SAY_S
+        if full and not self.out and self.clock() > self.next_say:
+            self.next_say = self.clock() + SAY_S
             console.print("Waiting for workers: the cluster has none yet that these stages can run on.")
 
     def _taken(self, number: int) -> _Out | None:
@@ -223,7 +228,7 @@ class Sharing:
 
     def _watch(self) -> None:
         """See in the store what is finished; take work back from workers that finish nothing any more."""
-        started = time.monotonic()
+        started = self.clock()
         if started < self.next_watch:
             return
         for number, out in list(self.out.items()):
@@ -233,16 +238,16 @@ class Sharing:
                 _advance(out, 1)
             sign = out.work.sign(out.left[0]) if out.left else None
             if sign is not None and sign != out.sign:
-                out.sign, out.seen = sign, time.monotonic()
+                out.sign, out.seen = sign, self.clock()
                 out.order.progress.show(sign.done, sign.total, sign.note)
             if not self.executor.workers(out.work.needs):  # all are gone: it waits for new ones
-                out.seen = time.monotonic()
-            if time.monotonic() - out.seen > out.order.settings.timeout_s:
+                out.seen = self.clock()
+            if self.clock() - out.seen > out.order.settings.timeout_s:
                 for other in self.executor.take_back(out.batch):
-                    self.out[other].seen = time.monotonic()
+                    self.out[other].seen = self.clock()
                 self._taken(number)
                 self._reclaim(out, f"finished nothing for {out.order.settings.timeout_s:g} s")
-        ended = time.monotonic()
+        ended = self.clock()
         self.next_watch = ended + max(POLL_S, (ended - started) / WATCHING_SHARE)
 
     def _reclaim(self, out: _Out, why: str) -> None:
@@ -268,7 +273,7 @@ class Sharing:
 
 def _advance(out: _Out, count: int) -> None:
     out.order.progress.advance(out.work.size([out.left.popleft() for _ in range(count)]))
-    out.seen = time.monotonic()
+    out.seen = out.order.clock()
 
 
 def batch_size(settings: ExecutionConfig, item_seconds: float | None, waiting: int, workers: int) -> int:

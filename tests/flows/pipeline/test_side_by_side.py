@@ -25,6 +25,7 @@ from flows.workers.pulse import Pulse, read_pulse
 from schemas.scene_store import SceneStore
 from schemas.tables import TIMINGS, read_rows
 from schemas.verify import verify
+from tests.flows.commands.test_reprocess import write_photos
 from tests.flows.pipeline.test_sweep import TRAINER, sweep_of
 from tests.flows.workers.scene import random_model, workers_of
 
@@ -100,12 +101,16 @@ def test_a_lost_workers_reconstruction_goes_on_from_its_last_state(tmp_path: Pat
     assert struck == swept(tmp_path / "whole", SOURCE, methods=methods, workers=1)
 
 
-def test_a_failure_ends_its_own_run_alone(tmp_path: Path, prefect_url: str) -> None:
-    methods = {"zipnerf": {"method": "zipnerf"}, "cat3d": {"method": "cat3d", "sample": {"checkpoint": "/nowhere"}}}
-    problems = run_sweep(sweep_of(SOURCE, methods=methods, base={"execution": {"workers": 2}}), tmp_path)
-    assert len(problems) == 1
-    assert "/nowhere" in problems[0]
-    assert {row["run"] for row in metrics_of(tmp_path)} == {"v3-zipnerf"}
+def test_a_failure_on_a_worker_ends_its_own_scene_alone_with_its_sentence(tmp_path: Path, prefect_url: str) -> None:
+    for name in ("good", "broken"):
+        write_photos(tmp_path / "data" / name)
+    photo = sorted((tmp_path / "data" / "broken").rglob("*.png"))[0]
+    photo.write_bytes(photo.read_bytes()[:200])
+    config = sweep_of(f"{tmp_path}/data/*", base={"execution": {"workers": 2}})
+    [problem] = run_sweep(config, tmp_path / "out")
+    assert problem.startswith("broken v3-zipnerf: ")
+    assert photo.name in problem
+    assert {row["scene_id"] for row in metrics_of(tmp_path / "out")} == {"good"}
 
 
 def jobs_of(out: Path, **changes: Any) -> list[Job]:
