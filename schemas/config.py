@@ -82,7 +82,10 @@ class PlanConfig(_Model):
     always_captured: bool = False
     """Captured views take conditioning slots before anchors do."""
     image_size: PositiveInt | None = None
-    """Side of the planned views in pixels; None: the generator's. Another is for views that another program makes."""
+    """Side of the planned views in pixels; None: the generator's own. SEVA takes other multiples of 64; others are for
+    views that another program makes."""
+    window: Annotated[int, Field(ge=4)] | None = None
+    """Views that SEVA makes and is given at once; None: as many as it was trained on, 21. Fewer need less memory."""
     wide: bool = False
     """Add the wide samples from padded squares for photos that aren't square."""
 
