@@ -138,9 +138,7 @@ def import_views(
     run_name: Annotated[str | None, typer.Option("--run", help="The run, where several have a plan.")] = None,
     note: Annotated[str, typer.Option(help="What made the pictures, such as a model's name; it is recorded.")] = "",
     partial: Annotated[bool, typer.Option("--partial", help="Some planned views may be missing.")] = False,
-    forget: Annotated[
-        bool, typer.Option("--forget", help="Drop imported views; they are generated here.")
-    ] = False,
+    forget: Annotated[bool, typer.Option("--forget", help="Drop imported views; they are generated here.")] = False,
 ) -> None:
     """Pictures of a plan's views that any other program made (see export --what plan) become the run's."""
     from flows.commands.import_views import import_views_command
