@@ -22,6 +22,7 @@ from pydantic import (
 )
 
 from schemas.errors import ConfigError
+from schemas.execution import ExecutionConfig
 from schemas.hints import HintsConfig
 from schemas.settings import merged, spelled_out
 from schemas.skip import SkipConfig
@@ -113,34 +114,6 @@ class SampleConfig(_Model):
     None: up to 2, the interval on the measured front."""
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """Of the network; the sampler's state is float32 always. bfloat16 and float16 are for GPUs."""
-
-
-class ExecutionConfig(_Model):
-    """Where and how the work is done. Nothing here changes a result beyond rounding."""
-
-    executor: Literal["local", "dask"] = "local"
-    """`local`: processes on this machine; `dask`: a Dask cluster, through prefect-dask."""
-    workers: PositiveInt | None = None
-    """Processes; None: one per GPU, or without GPUs one per `threads` CPU cores."""
-    threads: PositiveInt = 1
-    """CPU threads of each worker: with equal numbers results are equal bit for bit."""
-    groups_at_once: PositiveInt = 1
-    """Groups in one evaluation of the network. With 1 results are bit-identical however the work is shared out."""
-    batch_seconds: PositiveFloat = 10.0
-    """Groups are handed out in batches that take about this long, by what was measured so far."""
-    timeout_s: PositiveFloat = 600.0
-    """A worker that finishes nothing and gives no sign of life for so long is given up, its work handed to another."""
-    attempts: PositiveInt = 3
-    """Workers that may die on one and the same group or stage before the stage fails."""
-    dask_address: str | None = None
-    """Scheduler of a running Dask cluster, e.g. tcp://10.0.0.1:8786."""
-    dask_cluster: str | None = None
-    """Class of the cluster to start, e.g. dask_jobqueue.SLURMCluster; None: a LocalCluster on loopback."""
-    dask_options: dict[str, Any] = Field(default_factory=dict)
-    """Keyword arguments of that class."""
-    dask_resources: dict[str, NonNegativeFloat] = Field(default_factory=dict)
-    """Dask resources that work occupies, e.g. {GPU: 1}; workers must be started with them. GPU is not asked for by what
-    computes on none."""
 
 
 class ReconstructConfig(_Model):

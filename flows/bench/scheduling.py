@@ -23,7 +23,8 @@ from flows.jobs.needs import Needs
 from flows.progress import meter
 from flows.workers.sharing import Order, Sharing
 from flows.workers.work import Answer, Batch, Work
-from schemas.config import ExecutionConfig, RunConfig
+from schemas.config import RunConfig
+from schemas.execution import ExecutionConfig
 
 #: The stages of a run in the order they run: seconds (of an item; those of the sample are groups), whether a scene's.
 STAGES = (

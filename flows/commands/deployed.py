@@ -17,7 +17,8 @@ from flows.commands.sweep import named_sweep, with_settings
 from flows.errors import WorkerError
 from flows.jobs.request import Request
 from flows.pipeline.sweep import run_sweep
-from schemas.config import ExecutionConfig, RunConfig
+from schemas.config import RunConfig
+from schemas.execution import ExecutionConfig
 
 StageName = Literal[
     "ingest", "poses", "plan", "match", "encode", "sample", "decode", "reconstruct", "render", "evaluate"

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import torch
 
 from flows.errors import InputError
-from schemas.config import ExecutionConfig
+from schemas.execution import ExecutionConfig
 
 
 def device() -> str:

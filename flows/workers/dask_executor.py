@@ -25,8 +25,8 @@ from prefect_dask.client import PrefectDaskClient
 from flows.jobs.device import worker_count
 from flows.jobs.needs import Needs
 from flows.workers.work import Answer, Batch, run_batch
-from schemas.config import ExecutionConfig
 from schemas.errors import ConfigError
+from schemas.execution import ExecutionConfig
 
 # Its chatter at INFO is for people who run schedulers. Workers inherit the environment.
 os.environ.setdefault("DASK_LOGGING__DISTRIBUTED", "critical")

@@ -11,8 +11,8 @@ from flows.progress import Meter, meter
 from flows.workers.executors import open_executor
 from flows.workers.sharing import POLL_S, Order, Sharing, Totals
 from flows.workers.work import Work, run_batch
-from schemas.config import ExecutionConfig
 from schemas.decisions import skipped
+from schemas.execution import ExecutionConfig
 from schemas.scene_store import SceneStore
 
 #: The workers of this command, while `open_pool` is; every fan-out of its threads goes to them.

@@ -15,7 +15,7 @@ from typing import BinaryIO, cast
 from flows.jobs.device import total_memory, visible_gpus, worker_count
 from flows.jobs.needs import Needs
 from flows.workers.work import Answer, Batch
-from schemas.config import ExecutionConfig
+from schemas.execution import ExecutionConfig
 
 
 class LocalExecutor:

@@ -18,10 +18,10 @@ from flows.jobs.job import Job
 from flows.jobs.needs import Needs
 from flows.jobs.usage import Usage
 from flows.progress import Meter, console
-from flows.workers.executors import Executor
+from flows.workers.protocol import Executor
 from flows.workers.work import Answer, Batch, Sign, Work
-from schemas.config import ExecutionConfig
 from schemas.decisions import Decision, warning
+from schemas.execution import ExecutionConfig
 
 POLL_S = 1.0
 #: Looking at the store for progress takes at most this share of the time, however many batches are out.

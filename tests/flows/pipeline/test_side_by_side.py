@@ -192,7 +192,7 @@ def test_workers_are_shared_by_what_they_have() -> None:
 
     from flows.jobs.needs import Needs
     from flows.workers.local import LocalExecutor
-    from schemas.config import ExecutionConfig
+    from schemas.execution import ExecutionConfig
 
     small, large = Needs(memory_gb=1), Needs(gpu=True, memory_gb=6)
     executor = LocalExecutor(ExecutionConfig(workers=4), Path(os.environ["PREFECT_HOME"]).parent / "logs")

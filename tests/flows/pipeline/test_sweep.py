@@ -12,9 +12,10 @@ from typer.testing import CliRunner
 
 from flows.cli import app
 from flows.commands.results import compare
+from flows.commands.sweep import with_settings
 from flows.jobs.metric_table import metric_table
 from flows.pipeline.sweep import open_jobs, run_sweep, sweep_jobs
-from schemas.config import SceneSource, SweepConfig, parse_config
+from schemas.config import SceneSource, SweepConfig, load_config, parse_config
 from schemas.settings import merged
 from schemas.tables import TIMINGS, append_rows, read_rows
 from tests.flows.conftest import ROOT, command, environment
@@ -85,6 +86,16 @@ def test_shipped_sweeps_are_valid(path: Path) -> None:
     config = parse_config(yaml.safe_load(path.read_text()), path.name, SweepConfig)
     for label, settings in config.methods.items():
         parse_config(merged(config.base, settings, {"label": label}), path.name)
+
+
+def test_settings_of_the_command_line_are_those_of_all_runs(tmp_path: Path) -> None:
+    (tmp_path / "cluster.yaml").write_text("execution: {executor: dask, dask_address: tcp://10.0.0.1:8786}")
+    given = load_config(tmp_path / "cluster.yaml").model_dump(mode="json", exclude_unset=True)
+    changed = with_settings(sweep_of("procedural:llff/2?views=6&width=24&height=20"), given)
+    [[job]] = sweep_jobs(changed, tmp_path)[0]
+    assert (job.config.execution.executor, job.config.execution.dask_address) == ("dask", "tcp://10.0.0.1:8786")
+    assert job.config.reconstruct.overrides == TRAINER
+    assert sweep_of(workers=3).base["execution"] == {"workers": 3}, "short for it"
 
 
 def test_results_name_regressions_beyond_the_bound(tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ from flows.workers.executors import open_executor
 from flows.workers.fan_out import fan_out
 from flows.workers.sharing import batch_size
 from flows.workers.work import Answer, Batch, run_batch
-from schemas.config import ExecutionConfig
 from schemas.errors import StoreError
+from schemas.execution import ExecutionConfig
 from schemas.scene_store import SceneStore
 from tests.flows.workers.scene import chunk_times, run_of, run_stages
 
