@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from flows.errors import WorkerError
 from flows.jobs.device import cpu_threads, worker_count
 from flows.jobs.job import Job
 from flows.pipeline.costs import Costs, Outlook
@@ -65,7 +66,7 @@ def do_jobs(
     doing = _Doing(jobs, perform, finished, advanced)
     if settings.executor == "local" and (len(jobs) == 1 or worker_count(settings) == 1):
         with cpu_threads(settings.threads) if same_threads else contextlib.nullcontext():
-            return [doing.job(job) for job in jobs]
+            return doing.one_by_one()
     return doing.together()
 
 
@@ -84,6 +85,12 @@ class _Doing:
         self.meter: Meter | None = None
         self.pool: Sharing | None = None
 
+    def one_by_one(self) -> list[Result]:
+        """All jobs in this thread, in their order but for waves."""
+        order = sorted(self.jobs, key=lambda job: self.scenes[job.store_path].wave(job))
+        results = {id(job): self.job(job) for job in order}
+        return [results[id(job)] for job in self.jobs]
+
     def together(self) -> list[Result]:
         """All jobs on one set of workers, the longest first."""
         first = self.jobs[0]
@@ -100,6 +107,8 @@ class _Doing:
                 self._serve(self.pool, list(futures.values()))
             except BaseException:
                 self.pool.stop()  # whoever waits is let go; nothing new begins
+                for scene in self.scenes.values():
+                    scene.stop()
                 threads.shutdown(wait=True, cancel_futures=True)
                 raise
             threads.shutdown()
@@ -150,7 +159,7 @@ class _Scene:
         self.waves: list[dict[str, str]] = []  # the keys that the runs of a wave have in common
         self.waves_of: dict[str, int] = {}
         self.left: list[int] = []  # runs that are to be done yet, of each wave
-        self.turn = threading.Condition()
+        self.turn, self.stopped = threading.Condition(), False
         self.held = contextlib.ExitStack()
         self.users = 0
         self.made: dict[tuple[str, str], Future[StageRecord]] = {}
@@ -168,6 +177,12 @@ class _Scene:
         self.waves_of[job.run] = number
         self.left[number] += 1
 
+    def stop(self) -> None:
+        """Let runs go that wait for their turn."""
+        with self.turn:
+            self.stopped = True
+            self.turn.notify_all()
+
     def wave(self, job: Job) -> int:
         return self.waves_of[job.run]
 
@@ -176,7 +191,9 @@ class _Scene:
         """Wait for the waves before the run's; the store is open for writing inside."""
         wave = self.wave(job)
         with self.turn:
-            self.turn.wait_for(lambda: not any(self.left[:wave]))
+            self.turn.wait_for(lambda: self.stopped or not any(self.left[:wave]))
+            if self.stopped:
+                raise WorkerError("The work was stopped before this run began.")
         try:
             with self._open(job):
                 yield

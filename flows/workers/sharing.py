@@ -130,7 +130,7 @@ class Sharing:
         self.item_seconds: dict[str, float] = {}  # by stage
         self.number = 0
         self.most_workers = 1  # so far
-        self.next_watch = self.next_say = 0.0
+        self.next_watch, self.next_say = 0.0, clock() + SAY_S / 4
         self.stopped = False
 
     def place(self, order: Order) -> None:
