@@ -13,6 +13,7 @@ import threading
 import time
 from datetime import datetime
 from pathlib import Path
+from typing import Any, cast
 from uuid import UUID
 
 import psutil
@@ -34,7 +35,7 @@ from prefect.client.schemas.filters import (
 )
 from prefect.client.schemas.objects import StateType
 from prefect.context import FlowRunContext
-from prefect.states import Crashed
+from prefect.states import Crashed, State
 
 from flows.reporting.report import REPORT
 from flows.reporting.summary import markdown, paper_tables, summary_rows
@@ -62,7 +63,9 @@ def settle(client: SyncPrefectClient) -> list[UUID]:
         host, _, pid = (run.infrastructure_pid or "").rpartition(":")
         if host != platform.node() or not pid.isdigit() or _lives(int(pid), run.start_time):
             continue
-        state = Crashed(message=f"Its process {pid} on {host} is gone: it was killed. Run it again to go on.")
+        state: State[Any] = Crashed(
+            message=f"Its process {pid} on {host} is gone: it was killed. Run it again to go on."
+        )
         client.set_flow_run_state(run.id, state, force=True)
         tasks = client.read_task_runs(
             flow_run_filter=FlowRunFilter(id=FlowRunFilterId(any_=[run.id])),
@@ -122,6 +125,6 @@ class Advance:
             self.next = time.monotonic() + UPDATE_S
             percent, text = 100.0 * done / max(1, total), f"{done} of {total} stages {note}".strip()
             if self.artifact is None:
-                self.artifact = create_progress_artifact(percent, key=self.key, description=text)
+                self.artifact = cast(UUID, create_progress_artifact(percent, key=self.key, description=text))
             else:
                 update_progress_artifact(self.artifact, percent, description=text)
