@@ -12,6 +12,7 @@ import argparse
 import heapq
 import itertools
 import random
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -21,7 +22,8 @@ from typing import Any
 from flows.jobs.job import Job
 from flows.jobs.needs import Needs
 from flows.progress import meter
-from flows.workers.sharing import Order, Sharing
+from flows.workers.orders import Order
+from flows.workers.sharing import Sharing
 from flows.workers.work import Answer, Batch, Work
 from schemas.config import RunConfig
 from schemas.execution import ExecutionConfig
@@ -105,6 +107,19 @@ class SimulatedExecutor:
         pass
 
 
+class _Told(threading.Event):
+    """An event that is written down when it happens."""
+
+    def __init__(self, ended: list[threading.Event]) -> None:
+        super().__init__()
+        self.ended = ended
+
+    def set(self) -> None:
+        if not self.is_set():
+            self.ended.append(self)
+        super().set()
+
+
 class _Runs:
     """The runs of a sweep, which place their next order as soon as the last one is over."""
 
@@ -112,7 +127,8 @@ class _Runs:
         self.sharing, self.executor, self.clock = sharing, executor, clock
         rng = random.Random(0)
         self.settings = ExecutionConfig(timeout_s=1e9)
-        self.at: dict[int, tuple[Job, list[tuple[str, float]], Order]] = {}
+        self.at: dict[threading.Event, tuple[Job, list[tuple[str, float]]]] = {}
+        self.ended: list[threading.Event] = []
         self.left: dict[str, float] = {}
         self.waiting: dict[str, list[tuple[Job, list[tuple[str, float]]]]] = {}
         for scene, run in itertools.product(range(scenes), range(runs)):
@@ -141,19 +157,19 @@ class _Runs:
         with meter(name, count, quiet=True) as progress:
             order = Order([SimulatedWork(job, name, seconds, count)], self.settings, progress, self.clock)
         self.left[self._name(job)] -= seconds * count
-        self.at[id(order)] = (job, rest, order)
+        order.over = _Told(self.ended)
+        self.at[order.over] = (job, rest)
         self.sharing.place(order)
 
     def over(self) -> bool:
         """Go on with every run whose order is over; whether nothing is left."""
-        for key, (job, rest, order) in list(self.at.items()):
-            if order.over.is_set():
-                del self.at[key]
-                if rest:
-                    self._next(job, rest)
-                if rest and rest[0][0] == "plan":  # the scene's own stages are done: its other runs begin
-                    for other, stages in self.waiting.pop(job.scene_id, []):
-                        self._next(other, stages)
+        while self.ended:
+            job, rest = self.at.pop(self.ended.pop())
+            if rest:
+                self._next(job, rest)
+            if rest and rest[0][0] == "plan":  # the scene's own stages are done: its other runs begin
+                for other, stages in self.waiting.pop(job.scene_id, []):
+                    self._next(other, stages)
         return not self.at
 
 

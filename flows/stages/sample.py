@@ -22,7 +22,8 @@ from flows.generation.sampling import sampler_config, sampler_settings
 from flows.jobs.job import Job, Outcome
 from flows.jobs.needs import Needs
 from flows.jobs.stage import Stage, settings_of
-from flows.workers.fan_out import Totals, fan_out
+from flows.workers.fan_out import fan_out
+from flows.workers.orders import Totals
 from flows.workers.work import ViewMarks, ViewWork, is_done
 from schemas.decisions import Decision, chosen, skipped
 from schemas.scene_store import SceneStore

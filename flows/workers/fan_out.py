@@ -9,7 +9,8 @@ from pathlib import Path
 from flows.jobs.job import Job
 from flows.progress import Meter, meter
 from flows.workers.executors import open_executor
-from flows.workers.sharing import POLL_S, Order, Sharing, Totals
+from flows.workers.orders import Order, Totals
+from flows.workers.sharing import POLL_S, Sharing
 from flows.workers.work import Work, run_batch
 from schemas.decisions import skipped
 from schemas.execution import ExecutionConfig

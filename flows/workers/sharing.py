@@ -7,90 +7,26 @@ from __future__ import annotations
 
 import math
 import queue
-import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from flows.errors import WorkerError
 from flows.jobs.job import Job
 from flows.jobs.needs import Needs
-from flows.jobs.usage import Usage
-from flows.progress import Meter, console
+from flows.progress import console
+from flows.workers.orders import Clock, Order, Waiting
 from flows.workers.protocol import Executor
 from flows.workers.work import Answer, Batch, Sign, Work
-from schemas.decisions import Decision, warning
+from schemas.decisions import warning
 from schemas.execution import ExecutionConfig
 
 POLL_S = 1.0
 #: Looking at the store for progress takes at most this share of the time, however many batches are out.
 WATCHING_SHARE = 0.05
-Clock = Callable[[], float]
 #: How often it is said that there is no worker yet.
 SAY_S = 60.0
-
-
-@dataclass
-class Totals:
-    """What a fan-out did. busy_seconds: workers' time on batches, without loading_seconds (the model's); waited:
-    seconds in which no worker had time for it."""
-
-    workers: int = 0
-    batches: int = 0
-    busy_seconds: float = 0.0
-    loading_seconds: float = 0.0
-    waited: float = 0.0
-    decisions: list[Decision] = field(default_factory=list)
-    usage: Usage = field(default_factory=Usage)
-
-    def __add__(self, other: Totals) -> Totals:
-        summed = {n: getattr(self, n) + getattr(other, n) for n in vars(self) if n not in ("workers", "usage")}
-        return Totals(max(self.workers, other.workers), **summed, usage=self.usage.with_(other.usage))
-
-    def work(self) -> dict[str, float]:
-        """Counts for the stage's record."""
-        counts = ("workers", "batches", "busy_seconds", "loading_seconds")
-        return {name: getattr(self, name) for name in counts if self.workers}
-
-
-class Order:
-    """Works that are wanted done together, of one run or of many. over: nothing of them is left or under way."""
-
-    def __init__(
-        self, works: Sequence[Work], settings: ExecutionConfig, progress: Meter, clock: Clock = time.monotonic
-    ) -> None:
-        self.works, self.settings, self.progress, self.clock = works, settings, progress, clock
-        self.passes = [deque(deque(items) for items in work.passes if items) for work in works]
-        self.out: Counter[int] = Counter()  # batches that workers have, by number of the work
-        self.deaths: Counter[tuple[int, int]] = Counter()
-        self.totals = Totals()
-        self.error: Exception | None = None
-        self.over = threading.Event()
-        self.idle_since: float | None = clock()
-
-    def ready(self, w: int) -> deque[int]:
-        """Items of work w that can be handed out now: a pass begins when the one before it is done."""
-        passes = self.passes[w]
-        if passes and not passes[0] and not self.out[w]:
-            passes.popleft()
-        return passes[0] if passes else deque()
-
-    def fail(self, error: Exception) -> None:
-        """Hand out nothing more; the first error is the one that is raised."""
-        self.error = self.error or error
-        self.passes = [deque() for _ in self.works]
-
-    def settle(self) -> None:
-        """Note whether workers have something of it, and whether it is over."""
-        if self.out.total():
-            if self.idle_since is not None:
-                self.totals.waited += self.clock() - self.idle_since
-                self.idle_since = None
-            return
-        self.idle_since = self.idle_since or self.clock()
-        if not any(self.ready(w) for w in range(len(self.works))):
-            self.over.set()
 
 
 @dataclass
@@ -124,7 +60,8 @@ class Sharing:
     ) -> None:
         self.executor, self.priority, self.clock = executor, priority, clock
         self.incoming: queue.SimpleQueue[Order] = queue.SimpleQueue()
-        self.orders: list[Order] = []
+        self.orders: set[Order] = set()  # that are not over
+        self.waiting = Waiting()
         self.out: dict[int, _Out] = {}
         self.needs: Counter[Needs] = Counter()  # of the batches that are out
         self.item_seconds: dict[str, float] = {}  # by stage
@@ -144,46 +81,53 @@ class Sharing:
         """Serve orders until `over()`, which is asked after every change."""
         while not over():
             while not self.incoming.empty():
-                self.orders.append(self.incoming.get())
+                order = self.incoming.get()
+                self.orders.add(order)
+                self._consider(order)
             self._hand_out()
-            self._settle_orders()
             if over():
                 return
             for answer in self.executor.answers(POLL_S):
                 self._settle(answer)
-            self._settle_orders()
             self._watch()
 
     def stop(self) -> None:
         """Let everyone go who waits for an order."""
         self.stopped = True
         while not self.incoming.empty():
-            self.orders.append(self.incoming.get())
-        for order in self.orders:
+            self.orders.add(self.incoming.get())
+        for order in list(self.orders):
             order.fail(WorkerError("The work was stopped; run the same command again to go on."))
             order.over.set()
 
-    def _settle_orders(self) -> None:
-        for order in self.orders:
-            order.settle()
-        self.orders = [order for order in self.orders if not order.over.is_set()]
-
-    def _waiting(self) -> Iterator[tuple[Order, int]]:
-        """Works with items to hand out: the highest priority first, then those with most passes left, as their later
-        passes wait for this one."""
-        ready = [(order, w) for order in self.orders for w in range(len(order.works)) if order.ready(w)]
-        ranks = {id(order): (-self.priority(order.works[0].job), i) for i, order in enumerate(self.orders)}
-        yield from sorted(ready, key=lambda one: (ranks[id(one[0])], -len(one[0].passes[one[1]]), one[1]))
+    def _consider(self, order: Order) -> None:
+        """After a change: let the order wait for workers if it has something for them, let it go if it is over."""
+        order.settle()
+        if order.over.is_set():
+            self.orders.discard(order)
+            self.waiting.forget(order)
+        elif order.ready_works():
+            self.waiting.push(order, lambda: self.priority(order.works[0].job))
 
     def _hand_out(self) -> None:
         full: set[Needs] = set()
-        for order, w in self._waiting():
+        while (order := self.waiting.pop(full)) is not None:
+            if not self._hand_out_of(order):
+                full.add(order.needs)
+            self._consider(order)
+        if full and not self.out and self.clock() > self.next_say:
+            self.next_say = self.clock() + SAY_S
+            console.print("Waiting for workers: the cluster has none yet that these stages can run on.")
+
+    def _hand_out_of(self, order: Order) -> bool:
+        """Hand out what is ready of an order; False where there was no room for all of it."""
+        needs = order.needs
+        for w in order.ready_works():
             work, items = order.works[w], order.ready(w)
-            while items and work.needs not in full:
-                if self.executor.room(work.needs, self.needs) < 1:
-                    full.add(work.needs)
-                    break
-                workers = self.executor.workers(work.needs)
+            while items:
+                if self.executor.room(needs, self.needs) < 1:
+                    return False
+                workers = self.executor.workers(needs)
                 order.totals.workers = max(order.totals.workers, workers)
                 self.most_workers = max(self.most_workers, workers)
                 size = batch_size(order.settings, self.item_seconds.get(work.stage), len(items), workers)
@@ -191,11 +135,9 @@ class Sharing:
                 batch = work.batch(self.number, [items.popleft() for _ in range(size)])
                 self.out[self.number] = _Out(order, w, batch, deque(batch.items), self.clock())
                 order.out[w] += 1
-                self.needs[work.needs] += 1
+                self.needs[needs] += 1
                 self.executor.submit(batch)
-        if full and not self.out and self.clock() > self.next_say:
-            self.next_say = self.clock() + SAY_S
-            console.print("Waiting for workers: the cluster has none yet that these stages can run on.")
+        return True
 
     def _taken(self, number: int) -> _Out | None:
         """The batch is no longer out; None where it was given up on before."""
@@ -212,7 +154,12 @@ class Sharing:
             return
         if answer.died:
             self._reclaim(out, answer.died)
-            return
+        else:
+            self._take(answer, out)
+        self._consider(out.order)
+
+    def _take(self, answer: Answer, out: _Out) -> None:
+        """What a worker did, or the error it met."""
         try:
             answer.raise_error()
         except Exception as error:
@@ -247,6 +194,7 @@ class Sharing:
                     self.out[other].seen = self.clock()
                 self._taken(number)
                 self._reclaim(out, f"finished nothing for {out.order.settings.timeout_s:g} s")
+                self._consider(out.order)
         ended = self.clock()
         self.next_watch = ended + max(POLL_S, (ended - started) / WATCHING_SHARE)
 
