@@ -33,8 +33,9 @@ NonNegativeFloat = Annotated[FiniteFloat, Field(ge=0)]
 class IngestConfig(_Model):
     """Reading the photos."""
 
-    downscale: Annotated[FiniteFloat, Field(ge=1)] = 1
-    """Divide width and height by this."""
+    downscale: Annotated[FiniteFloat, Field(ge=1)] | None = None
+    """Divide width and height by this. None: to as many pixels as the preset's training can fill and the memory of the
+    device holds; photos that have about so many or fewer stay as they are."""
     max_pixels: PositiveInt = 100_000_000
     """Refuse larger source images, in pixels."""
     frames: Annotated[int, Field(ge=2)] = 60

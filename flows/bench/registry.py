@@ -20,6 +20,7 @@ from cat3d_core.metrics.perceptual import find_perceptual
 from cat3d_core.weights import default_model_path
 from cat3d_core.zipnerf import PRESETS
 from flows.bench import cameras, metrics, plan, poses, reconstruct, sampler, scenes, skips, splats, store, synthetic
+from flows.bench.size import size_rows
 from flows.errors import InputError
 from flows.generation.formats import cat3d
 from flows.media.images import read_image
@@ -286,6 +287,14 @@ BENCHES: dict[str, Bench] = {
         splat_rows,
         (Panel("Reconstructors", "cpu_s", "psnr", ("method",), ("preset", "seed"), ("family", "views"),
                higher_is_better=True),),
+    ),
+    "size": Bench(
+        "seconds and peak memory of a whole run by the number and size of the photos, as phones make them",
+        size_rows,
+        (
+            Panel("Seconds by the number of photos", "photos", "cpu_seconds", ("megapixels",)),
+            Panel("Memory by the number of photos", "photos", "peak_gb", ("megapixels",)),
+        ),
     ),
     "synthetic": Bench("procedural scenes rendered: views a second per family", synthetic_rows),
 }  # fmt: skip

@@ -27,7 +27,9 @@ def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
     """The training views, the reconstructor's settings in full, and what decides which pixels are trained on: a changed
     preset or rule makes old fields stale."""
     skip = job.config.skip
-    found = {"train": job.view_names("train"), "detail": skip.detail, "seen": skip.seen}
+    found: dict[str, Any] = {"train": job.view_names("train"), "detail": skip.detail, "seen": skip.seen}
+    if job.generates and skip.seen and job.capture().mask_training:
+        found["masks"] = True  # the brief field heeds them
     return found | dict(open_reconstructor(job).settings)
 
 
