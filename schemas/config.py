@@ -34,8 +34,7 @@ class IngestConfig(_Model):
     """Reading the photos."""
 
     downscale: Annotated[FiniteFloat, Field(ge=1)] | None = None
-    """Divide width and height by this. None: to as many pixels as the preset's training can fill and the memory of the
-    device holds; photos that have about so many or fewer stay as they are."""
+    """Divide width and height by this; None: as the preset and the device's memory suggest, small photos by 1."""
     max_pixels: PositiveInt = 100_000_000
     """Refuse larger source images, in pixels."""
     frames: Annotated[int, Field(ge=2)] = 60
