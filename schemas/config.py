@@ -110,6 +110,9 @@ class SampleConfig(_Model):
     guidance_log_snr: tuple[FiniteFloat | None, FiniteFloat | None] | None = None
     """Lowest and highest log-SNR at which guidance is on, where `skip.guidance` is; a bound of None: no bound.
     None: up to 2, the interval on the measured front."""
+    start: Literal["noise", "hint"] = "noise"
+    """Where sampling starts: from noise (the paper), or, for models that take hints, later and from what the photos
+    show."""
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """Of the network; the sampler's state is float32 always. bfloat16 and float16 are for GPUs."""
 

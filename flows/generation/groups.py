@@ -14,6 +14,7 @@ from cat3d_core.plan import Group
 from cat3d_core.random import normal
 from cat3d_core.sample_sets import KINDS, sample_cameras
 from cat3d_core.view_selection import pose_distance
+from flows.generation.hints import StoredHint, read_hint
 from flows.generation.plan import read_plan
 from flows.generation.views import captured_sample
 from flows.jobs.access import read_cameras
@@ -65,7 +66,16 @@ class StoredPlan:
             images=self._images(group, latents, generator) if "images" in generator.spec.wants else None,
             scene=self.captured[group.kind],
             planned=self._planned(group.kind) if "planned" in generator.spec.wants else None,
+            hints=self._hints(group) if "hints" in generator.spec.wants else {},
         )
+
+    def _hints(self, group: Group) -> dict[str, Tensor]:
+        """What the photos show of the targets, where the run has it."""
+        if "hints" not in self.run:
+            return {}
+        rows = [read_hint(self.run, view) for view in group.targets]
+        maps = {name: torch.stack([getattr(row, name) for row in rows]) for name in StoredHint._fields}
+        return maps | {"colour": maps["colour"].permute(0, 3, 1, 2) / 255}
 
     def _planned(self, kind: str) -> Cameras:
         """The cameras of all planned views of a sample set."""
