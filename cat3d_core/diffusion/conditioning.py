@@ -34,8 +34,8 @@ def make_condition(latents: Tensor, cameras: Tensor, hints: Tensor | None = None
 
 
 def drop_condition(condition: Condition, dropped: Tensor, what: Drop) -> Condition:
-    """The null condition for the groups where `dropped` [G] (bool): conditioning latents, hints and mask become zero, and
-    so do all cameras, and with them the rays, unless only images are dropped."""
+    """The null condition for the groups where `dropped` [G] (bool): conditioning latents, hints and mask become zero,
+    and so do all cameras, and with them the rays, unless only images are dropped."""
     keep = ~dropped
     maps = keep[:, None, None, None, None]
     cameras = condition.cameras * keep[:, None, None, None] if what == "images_and_poses" else condition.cameras

@@ -23,7 +23,7 @@ CONFIDENCE, INVERSE_DEPTH = -3, -2
 
 @torch.no_grad()
 def hint_latents(autoencoder: Autoencoder, hints: Mapping[str, Tensor]) -> Tensor:
-    """colour (N, 3, H, W) in [0, 1] and HINT_MAPS (N, H, W) -> (N, C + 4, H/8, W/8) float32, on the autoencoder's device.
+    """colour (N, 3, H, W) in [0, 1] and HINT_MAPS (N, H, W) -> (N, C + 4, H/8, W/8) float32, where the autoencoder is.
 
     Raises ValueError where a map is missing."""
     missing = sorted({"colour", *HINT_MAPS} - set(hints))

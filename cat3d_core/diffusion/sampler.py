@@ -17,7 +17,6 @@ from cat3d_core.diffusion.model import MultiViewModel
 from cat3d_core.diffusion.schedule import Nodes, Schedule, alpha_sigma
 from cat3d_core.diffusion.solvers import check_solver, integrate
 
-
 Start = Literal["noise", "hint"]
 #: log-SNR from which on the latents of a trusted hint are a better start than pure noise.
 START = -2.0

@@ -27,7 +27,8 @@ class TrainConfig:
     total_steps counts optimizer steps; the learning rate rises linearly for `warmup_steps`, then follows a half cosine
     down to `final_learning_rate` at total_steps. accumulate: calls of `step` per optimizer step. hint_weight: weight of
     the loss where a hint is wholly certain, as against 1 where it is not: there the finished view shows the hint and
-    not the sample. min_snr_gamma: weight of Hang et al. 2023 (None: uniform). precision: bfloat16 keeps float32 master weights.
+    not the sample. min_snr_gamma: weight of Hang et al. 2023 (None: uniform). precision: bfloat16 keeps float32 master
+    weights.
     """
 
     learning_rate: float = 5e-5
@@ -138,9 +139,7 @@ class Trainer:
         """Optimizer steps made."""
         return self.calls // self.config.accumulate
 
-    def step(
-        self, latents: Tensor, cameras: Tensor, n_condition: int, hints: Tensor | None = None
-    ) -> dict[str, float]:
+    def step(self, latents: Tensor, cameras: Tensor, n_condition: int, hints: Tensor | None = None) -> dict[str, float]:
         """One batch: latents [G, V, C, h, w], cameras [G, V, 4, 4], conditioning views first; hints [G, N, C + 4, h, w]
         of the others, for a network that takes them.
 

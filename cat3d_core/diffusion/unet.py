@@ -16,8 +16,8 @@ from cat3d_core.rays import matrix_rays
 class MultiViewUNet(nn.Module):
     """Parameters have the key names of diffusers' UNet2DConditionModel.
 
-    At initialisation the output does not depend on rays, mask and hints (their input channels are zero), so that an inflated
-    pretrained network starts as the network it was. Residual branches and the output start at zero, as in LDM.
+    At initialisation the output does not depend on rays, mask and hints (their input channels are zero), so that an
+    inflated pretrained network starts as the network it was. Residual branches and the output start at zero, as in LDM.
     """
 
     def __init__(self, config: UNetConfig) -> None:

@@ -23,7 +23,8 @@ def generate(
 
     scenes: images (M, 3, H, W) in [0, 1] of the given views, and the M + N cameras of given and target views, scene
     frame. noise(scene, view) -> (C, h, w), standard normal; views are counted from the first given one. hints: of the
-    targets of each scene (`ViewGroup.hints`), if there are any. More targets than the generator takes at once are sampled in several groups.
+    targets of each scene (`ViewGroup.hints`), if there are any. More targets than the generator takes at once are
+    sampled in several groups.
     """
     latents = [generator.encode(images) for images, _ in scenes]
     groups, scene_of = [], []

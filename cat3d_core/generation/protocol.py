@@ -63,8 +63,8 @@ class ViewGroup:
     own whatever its group. Optional, for those who want it (`GeneratorSpec.wants`): images (M, 3, H, W) float32 in
     [0, 1] of the given views; scene: the cameras of all captured views; hints: maps by name of what is known of the
     targets beforehand, as a plane sweep of photos finds it: colour (N, 3, H, W) in [0, 1], and (N, H, W) confidence,
-    inverse_depth, spread, seen (`cat3d_core.matching.hint.Hint`), or empty; planned: the cameras of all planned views of
-    the same sample set.
+    inverse_depth, spread, seen (`cat3d_core.matching.hint.Hint`), or empty; planned: the cameras of all planned views
+    of the same sample set.
     """
 
     latents: Tensor

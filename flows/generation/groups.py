@@ -28,8 +28,9 @@ CAPTURED_LATENTS = dict(zip(KINDS, ("captured", "captured_wide"), strict=True))
 class StoredPlan:
     """The plan of a run as the sampler needs it, read once; `plan` counts the store's captured views."""
 
-    def __init__(self, store: SceneStore, run: Run, seed: int) -> None:
-        self.store, self.run, self.seed = store, run, seed
+    def __init__(self, store: SceneStore, run: Run, seed: int, hinted: bool = True) -> None:
+        """hinted: what the run has of hints is used."""
+        self.store, self.run, self.seed, self.hinted = store, run, seed, hinted
         self.captured_count = store.captured.shape("size")[0]
         self.plan = read_plan(run.plan, self.captured_count)
         size = int(self.plan.cameras.size[0, 0])
@@ -71,7 +72,7 @@ class StoredPlan:
 
     def _hints(self, group: Group) -> dict[str, Tensor]:
         """What the photos show of the targets, where the run has it."""
-        if "hints" not in self.run:
+        if not self.hinted or "hints" not in self.run:
             return {}
         rows = [read_hint(self.run, view) for view in group.targets]
         maps = {name: torch.stack([getattr(row, name) for row in rows]) for name in StoredHint._fields}

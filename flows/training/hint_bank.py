@@ -5,6 +5,7 @@ what photos suffer, as in the sweep's own training (`flows/training/sweep_batche
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,12 +13,16 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from cat3d_core.cameras import Cameras
 from cat3d_core.diffusion import Autoencoder
 from cat3d_core.diffusion.hint_bank import HintBank
 from cat3d_core.diffusion.hints import hint_latents
+from cat3d_core.generation import Generator
+from cat3d_core.matching.checkpoint import load_sweep
 from cat3d_core.matching.hint import hint, observe
 from cat3d_core.matching.network import SweepNetwork
 from cat3d_core.random import generator
+from cat3d_core.weights import default_sweep_path
 from flows.training.renders import save, shards
 from flows.training.sweep_batches import augmented, cameras_of, chosen, misplaced, photographed, prepared
 
@@ -62,9 +67,11 @@ def hinted_group(
     raw: dict[str, Tensor], network: SweepNetwork, autoencoder: Autoencoder, given: int, views: int, size: int,
     random: torch.Generator,
 ) -> dict[str, Tensor]:  # fmt: skip
-    """One group of a scene (image, inverse_depth, intrinsics, world_from_camera) as HintBank holds it."""
+    """One group of a scene (image, intrinsics, world_from_camera) as HintBank holds it."""
     spread = _NARROWEST + (1 - _NARROWEST) * float(torch.rand((), generator=random))
-    scene = augmented(prepared(chosen(raw, views, spread, random), size, random), random)
+    unknown = torch.zeros(*raw["image"].shape[:1], *raw["image"].shape[-2:])  # depths are for the sweep's own training
+    drawn = chosen({"inverse_depth": unknown} | raw, views, spread, random)
+    scene = augmented(prepared(drawn, size, random), random)
     cameras = cameras_of(misplaced(scene.views, random), size)
     photos = photographed(scene.image[:given], random)
     device = autoencoder.latent_std.device
@@ -78,6 +85,23 @@ def hinted_group(
         "latents": latents.half(), "hints": hints.half(), "intrinsics": cameras.intrinsics.float(),
         "world_from_camera": cameras.world_from_camera.float(), "given": torch.tensor(given),
     }  # fmt: skip
+
+
+@functools.lru_cache(maxsize=1)
+def shipped_sweep() -> SweepNetwork:
+    """The shipped plane sweep, on the CPU."""
+    return load_sweep(default_sweep_path())
+
+
+def told(model: Generator, image: Tensor, cameras: Cameras) -> dict[str, Tensor]:
+    """For a model that takes hints: what the shipped plane sweep of the given views, image (M, 3, H, W), the first
+    of the cameras, says of the others. Nothing for other models."""
+    if "hints" not in model.spec.wants:
+        return {}
+    given = len(image)
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        observed = observe(shipped_sweep(), image, cameras[slice(0, given)])
+        return vars(hint(shipped_sweep(), observed, cameras[slice(given, None)]))
 
 
 def load_hint_bank(folder: Path, image_size: int) -> HintBank:

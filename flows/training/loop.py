@@ -47,7 +47,8 @@ def train_config(config: TrainRunConfig) -> TrainConfig:
     return TrainConfig(
         learning_rate=o.learning_rate, final_learning_rate=o.learning_rate, warmup_steps=o.warmup_steps,
         weight_decay=o.weight_decay, clip_norm=o.clip_norm, ema_decay=o.ema_decay, accumulate=o.accumulate,
-        drop_probability=o.drop_probability, drop=o.drop, hint_weight=o.hint_weight, min_snr_gamma=o.min_snr_gamma, precision=o.precision,
+        drop_probability=o.drop_probability, drop=o.drop, hint_weight=o.hint_weight,
+        min_snr_gamma=o.min_snr_gamma, precision=o.precision,
     )  # fmt: skip
 
 

@@ -51,7 +51,7 @@ def test_corruption_leaves_out_and_adds_as_often_as_it_says():
     hints = torch.ones(200, 5, CHANNELS, 8, 8)
 
     def run(**how: float) -> torch.Tensor:
-        off = dict(whole=0.0, view=0.0, masked=0.0, noisy=0.0)
+        off = {"whole": 0.0, "view": 0.0, "masked": 0.0, "noisy": 0.0}
         return corrupted(hints, torch.Generator().manual_seed(0), Corruption(**(off | how)))
 
     assert torch.equal(run(), hints)
