@@ -32,7 +32,8 @@ def hint_latents(autoencoder: Autoencoder, hints: Mapping[str, Tensor]) -> Tenso
     where = autoencoder.latent_std.device
     latents = autoencoder.encode(hints["colour"].float().to(where)).float()
     maps = torch.stack([hints[name].float().to(where) for name in HINT_MAPS], 1)
-    return torch.cat([latents, F.adaptive_avg_pool2d(maps, latents.shape[-2:])], 1)
+    height, width = latents.shape[-2:]
+    return torch.cat([latents, F.adaptive_avg_pool2d(maps, (height, width))], 1)
 
 
 def rescaled(hints: Tensor, factor: Tensor) -> Tensor:

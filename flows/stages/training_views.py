@@ -18,9 +18,8 @@ from flows.media.images import resize
 from schemas.decisions import Decision, chosen, skipped
 from schemas.scene_store import Run, SceneStore
 
-
 #: Share of the pixels of generated views that captured ones show as well from which on none is trained on. Measured on
-#: the procedural sweep: below 0.4 generated views gain 2 to 8 dB, from 0.5 on -0.7 to 0.3 (docs/log/2026-11-28_hints.md).
+#: the procedural sweep: below 0.4 they gain 2 to 8 dB, from 0.5 on -0.5 to 0.1 (docs/log/2026-11-28_hints.md).
 ENOUGH = 0.5
 
 
@@ -106,9 +105,9 @@ def unseen(job: Job, views: Views) -> tuple[torch.Tensor | None, Decision | None
     share = float(shown.sum()) / pixels
     says = f"too, by a brief reconstruction of those views ({time.monotonic() - started:.0f} s)."
     if share >= ENOUGH:
-        text = f"No generated view was trained on: {LEAST} captured views show the places of {share:.0%} of their pixels "
-        text += f"{says} The rest would cost more than it gives."
+        text = f"No generated view was trained on: {LEAST} captured views show the places of {share:.0%} of their "
+        text += f"pixels {says} The rest would cost more than it gives."
         return None, skipped(text, "seen", pixels=pixels)
-    text = f"{share:.0%} of the pixels of generated views were not trained on: {LEAST} captured views show their places "
-    text += f"{says} They get at least that share of the rays."
+    text = f"{share:.0%} of the pixels of generated views were not trained on: {LEAST} captured views show their "
+    text += f"places {says} They get at least that share of the rays."
     return ~shown, skipped(text, "seen", pixels=int(shown.sum()))
