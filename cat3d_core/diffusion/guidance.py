@@ -39,8 +39,12 @@ def guided(
         return predict(condition, x)
     groups = x.shape[0]
     latents, cameras, mask, hints = condition
-    told = None if hints is None else torch.cat([hints, hints])
-    doubled = Condition(*(torch.cat([part, part]) for part in (latents, cameras, mask)), hints=told)
+    doubled = Condition(
+        torch.cat([latents, latents]),
+        torch.cat([cameras, cameras]),
+        torch.cat([mask, mask]),
+        None if hints is None else torch.cat([hints, hints]),
+    )
     dropped = torch.arange(2 * groups, device=x.device) >= groups
     both = predict(drop_condition(doubled, dropped, config.drop), torch.cat([x, x]))
     conditional, unconditional = both[:groups], both[groups:]
