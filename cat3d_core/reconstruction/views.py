@@ -101,9 +101,9 @@ class Views:
         take eight bytes for each."""
         assert self.valid is not None
         whole = len(self.valid) // _BLOCK * _BLOCK
-        counts = self.valid[:whole].view(-1, _BLOCK).sum(1)
-        counts = torch.cat([counts.new_zeros(1), counts, self.valid[whole:].sum()[None]])
-        return counts.cumsum(0)
+        # In parts: to be summed, truth values are turned into integers of eight bytes.
+        counts = [part.view(-1, _BLOCK).sum(1) for part in self.valid[:whole].split(_BLOCK << 18)]
+        return torch.cat([self.offset.new_zeros(1), *counts, self.valid[whole:].sum()[None]]).cumsum(0)
 
     def _block(self, block: Tensor) -> Tensor:
         """(R, _BLOCK) bool: which pixels of blocks (R,) count."""

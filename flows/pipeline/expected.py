@@ -15,13 +15,13 @@ from schemas.scene_store import SceneStore
 from schemas.stages import StageRecord
 
 #: Bytes of a process that has imported everything, and of each pixel of a photo while it is read (by two at a time).
-BASE_BYTES, READ_BYTES = 0.7e9, 40
+BASE_BYTES, READ_BYTES = 0.6e9, 30
 #: Earlier scenes in the same folder that are looked at.
 SCENES = 20
 #: Seconds for a unit of work (see `work_of`) on two cores of 2026, where there is no earlier timing in the folder.
 #: Those that depend on the preset have its name too.
 USUAL = {
-    ("ingest", ""): 6e-8, ("poses", ""): 3.0, ("evaluate", ""): 6e-7,
+    ("ingest", ""): 4e-8, ("poses", ""): 3.0, ("evaluate", ""): 6e-7,
     ("reconstruct", "tiny"): 8.0, ("reconstruct", "fast"): 80.0, ("reconstruct", "balanced"): 1200.0,
     ("render", "tiny"): 1e-5, ("render", "fast"): 3e-5, ("render", "balanced"): 1e-4,
 }  # fmt: skip
