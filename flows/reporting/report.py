@@ -21,8 +21,10 @@ from flows.jobs.metric_table import metric_table
 from flows.media.pictures import depth_picture, error_picture
 from flows.reporting.answer import answers, best_runs, rivals
 from flows.reporting.charts import Point, Series, chart
+from flows.reporting.seeds import NOISE, seeds_of
 from flows.reporting.summary import (
     markdown,
+    mean_text,
     method_order,
     method_times,
     missing_networks,
@@ -59,7 +61,7 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
     tables = paper_tables(rows)
     sweep = _document(out / SWEEP) or {}
     environment = Environment(loader=PackageLoader("flows.reporting"), autoescape=select_autoescape(["html", "j2"]))
-    environment.filters |= {"fixed": number, "title": title}
+    environment.filters |= {"fixed": number, "mean": mean_text, "title": title}
     published = any(e["published"] for t in tables for d in t["datasets"] for e in d["rows"])
     context = {
         "title": sweep.get("name", out.name),
@@ -72,6 +74,8 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
         "psnr": {(r["scene_id"], r["run"]): r["psnr_db"] for r in rows},
         "tables": tables,
         "published": published,
+        "noise": NOISE,
+        "seeds": seeds_of(rows),
         "paper_metrics": paper_metrics(),
         "shown": shown_metrics(rows),
         "missing": missing_networks(rows),
