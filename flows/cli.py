@@ -212,7 +212,7 @@ def results(
     out: Annotated[Path, typer.Argument(help="The --out folder of a run or sweep.")],
     against: Annotated[
         Path | None,
-        typer.Option(help="Another folder: print changes, exit 1 on one for the worse beyond seeds' noise."),
+        typer.Option(help="Another folder: print changes; exit 1 where it was better beyond seeds' noise."),
     ] = None,
 ) -> None:
     """Print an output folder's numbers and compare them with another's."""

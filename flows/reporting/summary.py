@@ -215,8 +215,8 @@ def markdown(rows: Sequence[dict[str, Any]], tables: Sequence[dict[str, Any]]) -
         columns = ["data set", "method", "what", *(f"{s} views" for s in table["splits"])]
         lines += [
             f"{' / '.join(map(title, paper_metrics()))}, protocol {table['protocol']}. In italics: the paper's, of "
-            f"other scenes and sizes, LPIPS by another network. ± is the standard error over seeds; {NOISE} is as good as "
-            "the best of ours within it.",
+            f"other scenes and sizes, LPIPS by another network. ± is the standard error over seeds; {NOISE} is as "
+            "good as the best of ours within it.",
             "",
             _line(columns),
             "|" + "---|" * len(columns),

@@ -30,7 +30,7 @@ def write_table(page: Path, sweep: Path) -> None:
 
 
 def table(sweep: Path) -> str:
-    """A row for each data set: PSNR (dB) of both methods, the gain, with standard errors over seeds, the paper's gain."""
+    """A row for each data set: PSNR (dB) of both methods and the gain, with errors over seeds, and the paper's gain."""
     found: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for row in summary_rows(sweep):
         if row["split"] == SPLIT and row["protocol"] == "google" and row["psnr_db"] is not None:

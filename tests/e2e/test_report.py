@@ -12,12 +12,12 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from cat3d_core.metrics.seeds import Mean
 from flows.jobs.metric_table import metric_table
 from flows.reporting.answer import answers
 from flows.reporting.charts import Point, Series, chart, log_ticks, ticks
 from flows.reporting.published import PUBLISHED
 from flows.reporting.report import write_report
-from cat3d_core.metrics.seeds import Mean
 from flows.reporting.summary import paper_tables, summary_rows, timing_rows
 from schemas.tables import TIMINGS, append_rows
 from tests.flows.conftest import ROOT, SCENE, TINY, command, environment, prefect_url  # noqa: F401

@@ -209,7 +209,8 @@ def test_a_path_can_be_fitted_to_more_views_than_are_captured() -> None:
     assert alone.recipe == "co3d"  # three views on an arc of 60 degrees
     assert fitted.recipe == "mipnerf360"
     whole = make_plan(everything, PlanConfig(count=60, image_size=32))
-    assert torch.equal(fitted.cameras.world_from_camera, whole.cameras.world_from_camera)
+    # Not to the bit: the last one of a sum depends on where in memory its terms lie.
+    torch.testing.assert_close(fitted.cameras.world_from_camera, whole.cameras.world_from_camera, rtol=0, atol=1e-12)
     assert fitted.captured_count == 3
     assert fitted.condition.max() == 2
 
