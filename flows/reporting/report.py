@@ -40,6 +40,7 @@ from flows.reporting.summary import (
 )
 from flows.reporting.turning import PAGE_BYTES, turning_scene
 from flows.stages import STAGES
+from schemas.documents import write_bytes
 from schemas.scene_store import Run, SceneStore
 from schemas.tables import TIMINGS, read_rows
 
@@ -90,8 +91,9 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
         "versions": versions(out, scenes),
         "sweep": sweep,
     }
-    page.write_text(environment.get_template("report.html.j2").render(context), encoding="utf-8")
-    (out / "report.md").write_text(markdown(rows, tables), encoding="utf-8")
+    text = environment.get_template("report.html.j2").render(context)
+    write_bytes(out / "report.md", markdown(rows, tables).encode())
+    write_bytes(page, text.encode())  # last, and at once: `only_if_changed` takes a page that is there for a whole one
     return page
 
 

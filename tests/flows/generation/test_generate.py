@@ -56,7 +56,7 @@ def test_photos_in_generated_views_field_and_renders_out(model: Path, tmp_path: 
     def stale(checkpoint: Path) -> list:
         given = [*TINY, *options(checkpoint)]
         texts = [value for flag, value in zip(given[::2], given[1::2]) if flag == "--set"]
-        config = make_config({"method": "cat3d"}, None, texts)
+        config = make_config({"method": "cat3d", "downscale": 1.0, "preset": "fast", "seed": 0}, None, texts)
         return [pending(job) for job in Request(SCENE, tmp_path, ("3", "1"), config).jobs()]
 
     assert stale(model) == [[], []]
