@@ -246,7 +246,10 @@ def load_config(path: str | Path, model: type[BaseModel] = RunConfig) -> Any:
     except OSError as error:
         raise ConfigError(f"{path} can't be read: {error.strerror}.") from None
     try:
-        document = json.loads(text) if path.suffix == ".json" else yaml.load(text, _UniqueKeys)
+        if path.suffix == ".json":
+            document = json.loads(text)
+        else:
+            document = yaml.load(text, _UniqueKeys)  # nosec B506 # a SafeLoader
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         kind = "JSON" if path.suffix == ".json" else "YAML"
         raise ConfigError(f"{path} is not valid {kind}: {' '.join(str(error).split())}.") from None

@@ -137,3 +137,17 @@ def test_a_method_that_is_no_word(tmp_path: Path) -> None:
     (tmp_path / "run.yaml").write_text("method: [zipnerf, cat3d]\n")
     with pytest.raises(ConfigError, match="method is"):
         load_config(tmp_path / "run.yaml")
+
+
+def test_packages_that_nobody_knows_are_not_said_to_be_without_vulnerabilities() -> None:
+    """pip-audit ends with "No known vulnerabilities found" where a mirror knows none of the packages."""
+    from infra.audit import verdict
+
+    known = {"name": "a", "version": "1", "vulns": []}
+    bad = {"name": "b", "version": "2", "vulns": [{"id": "CVE-1", "fix_versions": ["3"]}]}
+    unknown = {"name": "c", "skip_reason": "Dependency not found on PyPI"}
+    assert verdict({"dependencies": [known]}) == (["1 of 1 pinned packages were looked up."], 0)
+    lines, code = verdict({"dependencies": [known, bad, unknown]})
+    assert code == 1
+    assert lines[0] == "b 2: CVE-1, mended in 3"
+    assert lines[1:] == ["2 of 3 pinned packages were looked up.", "Nothing is known of c."]
