@@ -123,7 +123,6 @@ def _pairs(
         if {r[column] for r in now} != {r[column] for r in before}:
             return  # numbers of two networks are not comparable
     scenes = sorted({r["scene_id"] for r in now} & {r["scene_id"] for r in before})
-    for scene in scenes if len(scenes) > 1 else []:
-        yield scene, *([r for r in rows if r["scene_id"] == scene] for rows in (now, before))
-    if scenes:
-        yield ALL_SCENES, *([r for r in rows if r["scene_id"] in scenes] for rows in (now, before))
+    groups = [(scene, [scene]) for scene in scenes if len(scenes) > 1]
+    for name, members in [*groups, (ALL_SCENES, scenes)] if scenes else []:
+        yield name, [r for r in now if r["scene_id"] in members], [r for r in before if r["scene_id"] in members]

@@ -94,7 +94,7 @@ def answers(rows: Sequence[dict[str, Any]]) -> list[Answer]:
         ]
         standings.sort(key=lambda s: -s.psnr_db)
         first = [[r for r in here if r["method"] == s.method and r["scene_id"] in common] for s in standings[:2]]
-        gain = change(*first, "psnr_db") if len(first) == 2 else None
+        gain = change(first[0], first[1], "psnr_db") if len(first) == 2 else None
         out.append(Answer(split, len(common), tuple(standings), gain))
     return out
 

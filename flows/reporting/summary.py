@@ -126,7 +126,7 @@ def paper_tables(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _entry(method: str, published: bool, what: str, members: Sequence[dict[str, Any]], splits: Sequence[str]) -> dict:
-    cells = []
+    cells: list[dict[str, Mean | None] | None] = []
     for split in splits:
         found = [m for m in members if m["split"] == split]
         if published:  # one number each, whatever it is a mean of

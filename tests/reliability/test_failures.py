@@ -29,22 +29,22 @@ def drive(folder: Path, task: str, *options: str) -> dict[str, Any]:
     return report
 
 
-@pytest.mark.parametrize(
-    "every", [599, pytest.param(7, marks=[pytest.mark.slow, pytest.mark.timeout(1400)])], ids=["some", "many"]
-)
+@pytest.mark.slow
+@pytest.mark.timeout(1400)
+@pytest.mark.parametrize("every", [61])
 def test_a_call_that_the_system_refuses_ends_in_a_sentence_and_the_next_run_is_whole(every: int, tmp_path: Path):
     report = drive(tmp_path, "refuse", str(every), "one")
     calls, refused, tolerated = map(sum, zip(*report["stages"].values()))
-    assert calls > 2000, "every layer is seen"
+    assert calls > 1500, "every layer is seen"
     assert refused + tolerated >= calls // every
     assert not report["faults"], "\n\n".join(report["faults"])
 
 
-@pytest.mark.parametrize(
-    "every", [797, pytest.param(17, marks=[pytest.mark.slow, pytest.mark.timeout(1400)])], ids=["some", "many"]
-)
+@pytest.mark.slow
+@pytest.mark.timeout(1400)
+@pytest.mark.parametrize("every", [67])
 def test_what_was_not_synced_when_the_power_failed_is_made_again(every: int, tmp_path: Path) -> None:
     report = drive(tmp_path, "lose", str(every))
-    assert report["changes"] > 1500
+    assert report["changes"] > 1000
     assert report["replayed"] == 3 * (report["changes"] // every)
     assert not report["faults"], "\n\n".join(report["faults"])
