@@ -12,9 +12,11 @@ import viser
 
 from cat3d_core.cameras import Cameras
 from flows.errors import describe
+from flows.exports.preview import within
 from flows.media.images import to_uint8
 from flows.reporting.content import ShownView
 from flows.viewer import layers
+from flows.viewer.beside import SIDE
 from flows.viewer.cameras import camera_of, place, vertical_fov
 from flows.viewer.ladder import Ladder, Picture, Wish
 from flows.viewer.panel import Panel
@@ -22,8 +24,10 @@ from flows.viewer.run import OpenRun, Runs
 
 REST = 0.25
 """Seconds without a move after which a camera rests."""
-FRUSTUM = 0.12
+FRUSTUM = 0.08
 """Size of a frustum in scene units: the cameras look at the origin from about 1."""
+HIDDEN = 2.5 * FRUSTUM
+"""Cameras that are nearer than this to the one that looks are left out: their pictures would be all that it sees."""
 
 
 class Session:
@@ -91,9 +95,8 @@ class Session:
         with self._lock:
             for group, handles in self._views.items():
                 for handle in handles:
-                    # One that stands in a frustum would see its picture, not the scene.
-                    inside = here is not None and float(np.linalg.norm(handle.position - here)) < FRUSTUM
-                    if handle.visible != (on(group) and not inside):
+                    close = here is not None and float(np.linalg.norm(handle.position - here)) < HIDDEN
+                    if handle.visible != (on(group) and not close):
                         handle.visible = not handle.visible
             for name, handle in self._layers.items():
                 if handle is not None:
@@ -151,14 +154,15 @@ class Session:
             self.client.camera.fov = vertical_fov(camera)
 
     def clicked(self, view: ShownView) -> None:
-        """Fly to a view, and show its picture beside what the reconstruction shows there."""
+        """Fly to a view, and show its photo and generated view beside what the reconstruction shows there."""
         self.fly(view.camera)
         run = self.run
         rendered = None
         if run is not None and run.scene is not None:
             try:
+                camera = within(view.camera, SIDE).to(dtype=torch.float32)
                 with torch.no_grad():
-                    rendered = to_uint8(run.scene.render(view.camera.to(dtype=torch.float32), 0).image.cpu())
+                    rendered = to_uint8(run.scene.render(camera, 0).image.cpu())
             except Exception as error:
                 self.say(describe(error) or str(error))
         self.panel.beside(view, rendered)
