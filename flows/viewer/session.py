@@ -39,6 +39,7 @@ class Session:
         self._lock = threading.RLock()
         self._views: dict[str, list[Any]] = {}
         self._layers: dict[str, Any] = {}
+        self._placed = False
         self._timer: threading.Timer | None = None
         self._resting = False
         self.shown_picture: tuple[Wish, Picture] | None = None
@@ -54,16 +55,13 @@ class Session:
     # What there is to see
 
     def open(self, run: OpenRun) -> None:
-        """Show another run, from its first captured view."""
+        """Show another run, from its first captured view as soon as there is one."""
         with self._lock:
             self.run = run
             self.client.scene.reset()
-            self._views, self._layers = {}, {}
+            self._views, self._layers, self._placed = {}, {}, False
             self.draw()
             self.panel.opened()
-            first = next(iter(run.views), None)
-            if first is not None:
-                self.fly(first.camera)
         self.moved()
 
     def draw(self) -> None:
@@ -82,10 +80,13 @@ class Session:
                     self._views["planned"].remove(handle)
             planned = [view for view in run.views if view.kind in ("planned", "generated")]
             self._layers["path"] = layers.add_path(self.client.scene, planned)
-            if "points" not in self._layers:
+            if self._layers.get("points") is None:
                 self._layers["points"] = layers.add_points(self.client.scene, run.points)
             if run.splats is not None:
                 self._layers["splats"] = layers.add_splats(self.client.scene, run.splats, not self._resting)
+            if run.views and not self._placed:  # a run that has just begun has no cameras yet
+                self._placed = True
+                self.fly(run.views[0].camera)
         self.shown()
 
     def shown(self) -> None:
