@@ -4,7 +4,6 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 DEMO_OUT ?= outputs/demo
 DEMO_ARGS ?=
-FIGURE_ARGS ?=
 
 .PHONY: demo test test-slow lint docs figures setup clean
 
@@ -33,11 +32,12 @@ docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --config-file infra/docs/mkdocs.yml
 	@echo "Site: outputs/site/index.html"
 
-# Every picture of the documents: the scene of the README is made first (once), charts come from tables in docs/.
-# README's table of quality comes from a sweep: make figures FIGURE_ARGS="--sweep outputs/sweep"
+# Every picture of the documents and README's table of quality, in one command: two small sweeps are made first (once,
+# half an hour of two idle cores), charts come from tables in docs/.
 figures: setup
 	$(BIN)/cat3d sweep infra/docs/showcase.yaml --out outputs/showcase
-	$(BIN)/python -m infra.docs.figures --showcase outputs/showcase $(FIGURE_ARGS)
+	$(BIN)/cat3d sweep infra/docs/quality.yaml --out outputs/quality
+	$(BIN)/python -m infra.docs.figures --showcase outputs/showcase --sweep outputs/quality
 
 clean:
 	rm -rf $(VENV) outputs build *.egg-info

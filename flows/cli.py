@@ -31,10 +31,10 @@ def run(
     text_settings: Annotated[str, typer.Option(help="Its settings, e.g. {steps: 20, guidance: 5, side: 512}.")] = "",
     views: Annotated[str, typer.Option(help="Training views: counts of a split, or all; several by commas.")] = "all",
     downscale: DownscaleOption = 1,
-    method: Annotated[str, typer.Option(help="zipnerf: photos; cat3d: and generated views; auto: by number.")] = "auto",
+    method: Annotated[str, typer.Option(help="zipnerf; cat3d: with generated views; auto: for one photo.")] = "auto",
     preset: Annotated[str, typer.Option(help="reconstruction preset: tiny, fast, balanced, paper.")] = "fast",
     seed: SeedOption = 0,
-    model: Annotated[Path | None, typer.Option(help="A generator's file or folder, not the shipped model.")] = None,
+    model: Annotated[Path | None, typer.Option(help="Another generator than the shipped one: file or folder.")] = None,
     reader: ReaderOption = "auto",
     images: ImagesOption = None,
     config: ConfigOption = None,
@@ -138,7 +138,7 @@ def import_views(
     run_name: Annotated[str | None, typer.Option("--run", help="The run, where several have a plan.")] = None,
     note: Annotated[str, typer.Option(help="What made the pictures, such as a model's name; it is recorded.")] = "",
     partial: Annotated[bool, typer.Option("--partial", help="Some planned views may be missing.")] = False,
-    forget: Annotated[bool, typer.Option("--forget", help="Generate the views here again instead.")] = False,
+    forget: Annotated[bool, typer.Option("--forget", help="Drop imported views; they are generated here.")] = False,
 ) -> None:
     """Pictures of a plan's views that any other program made (see export --what plan) become the run's."""
     from flows.commands.import_views import import_views_command
@@ -151,9 +151,9 @@ def import_views(
 @app.command()
 def view(
     path: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder), or the folder of a run or sweep.")],
-    run_name: Annotated[str | None, typer.Option("--run", help="The run to begin with.")] = None,
-    port: Annotated[int, typer.Option(help="Where it is served.")] = 8080,
-    host: Annotated[str, typer.Option(help="Address to serve on; any but loopback asks for a token.")] = "127.0.0.1",
+    run_name: Annotated[str | None, typer.Option("--run", help="The run that is shown first.")] = None,
+    port: Annotated[int, typer.Option(help="Port to serve it at.")] = 8080,
+    host: Annotated[str, typer.Option(help="Address to serve it on; all but loopback need a token.")] = "127.0.0.1",
 ) -> None:
     """Look at scenes in the browser: cameras, pictures, splats, the field itself; also while they are being made."""
     from flows.commands.view import view_command

@@ -82,7 +82,9 @@ class PlanConfig(_Model):
     always_captured: bool = False
     """Captured views take conditioning slots before anchors do."""
     image_size: PositiveInt | None = None
-    """Side of the planned views in pixels; None: the generator's. Another is for views that another program makes."""
+    """Side of the planned views in pixels; None: the generator's. SEVA takes multiples of 64, other programs any."""
+    window: Annotated[int, Field(ge=4)] | None = None
+    """Views that SEVA makes and is given at once; None: as many as it was trained on, 21. Fewer need less memory."""
     wide: bool = False
     """Add the wide samples from padded squares for photos that aren't square."""
 
@@ -95,8 +97,7 @@ class SampleConfig(_Model):
     """
 
     generator: str | None = None
-    """Which generator: "cat3d" or the name of an installed package's (docs/guides/own_generator.md); None: the one that
-    recognises the checkpoint."""
+    """Generator: "cat3d", "seva", or that of an installed package; None: the one that recognises the checkpoint."""
     checkpoint: Path | None = None
     """File or folder with the generator's weights; None: the ones shipped."""
     solver: str | None = None

@@ -1,4 +1,4 @@
-"""Whether generated views are told what the photos show, and by which plane sweep."""
+"""Whether what the photos show is carried into generated views, and by which plane sweep."""
 
 from __future__ import annotations
 

@@ -119,7 +119,8 @@ class TrainRunConfig(_Model):
     """Share of a scene's cameras, nearest first, that a group is drawn from: at the start, and after 70 % of the
     training."""
     scale_jitter: Annotated[FiniteFloat, Field(ge=1)] = 1.4
-    """Ray origins are scaled by a random number from 1 / this to this: in use a scene's unit is only known about."""
+    """Ray origins are scaled by a random number from 1 / this to this: when the model is used, a scene's unit is only
+    roughly known."""
     start: Path | None = None
     """Weights to start from: a model file of ours, or Stable Diffusion's U-Net (diffusers folder, or safetensors)."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0

@@ -12,7 +12,9 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "in
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)|<img[^>]*src=\"([^\"]+)\"|^\[[^\]]+\]: (\S+)$", re.M)
 #: Written by a program from measurements, or a record of the past: their lines may be long.
 FREE = {ROOT / "docs/reference/benchmarks.md", *(ROOT / "docs/log").glob("*.md")}
-LONGEST, README_LINES, PICTURE_BYTES = 100, 120, 300_000
+LONGEST, LONGEST_ROW, README_LINES, PICTURE_BYTES = 100, 150, 120, 300_000
+#: Written by a program: as many columns as there are number formats.
+WIDE = FREE | {ROOT / "docs/reference/stress.md"}
 
 
 def anchors(page: Path) -> set[str]:
@@ -62,6 +64,12 @@ def prose(page: Path) -> list[str]:
 def test_lines_of_prose_are_short(page: Path) -> None:
     long = [line for line in prose(page) if len(line) > LONGEST]
     assert not long, f"{page.relative_to(ROOT)} has lines of over {LONGEST} characters: {long}"
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p not in WIDE], ids=lambda p: str(p.relative_to(ROOT)))
+def test_rows_of_tables_are_short(page: Path) -> None:
+    long = [line for line in page.read_text().splitlines() if line.startswith("|") and len(line) > LONGEST_ROW]
+    assert not long, f"{page.relative_to(ROOT)} has rows of over {LONGEST_ROW} characters: {long}"
 
 
 def test_readme_is_short_and_shows_pictures() -> None:

@@ -1,4 +1,4 @@
-"""What the network is told beside the noisy latents: which views are given, and from where each view looks."""
+"""What the network is given beside the noisy latents: which views are given, and from where each view looks."""
 
 from __future__ import annotations
 

@@ -91,8 +91,8 @@ class UNetConfig:
 class ScheduleConfig:
     """Noise. The log-SNR of `base` is lowered by log(number of targets) when `shift` is set (paper, section 3.1).
 
-    time_input: what the network is told: "noise" = the step of the unshifted table that has the same log-SNR (what a
-    pretrained network knows), "index" = the step itself.
+    time_input: the time that the network is given: "noise" = the step of the unshifted table that has the same log-SNR
+    (what a pretrained network knows), "index" = the step itself.
     """
 
     base: Literal["scaled_linear", "linear", "cosine"] = "scaled_linear"

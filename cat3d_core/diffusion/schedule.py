@@ -41,8 +41,8 @@ class Schedule:
         self.log_snr = self.base_log_snr - (math.log(targets) if config.shift else 0.0)
 
     def time(self, log_snr: Tensor) -> Tensor:
-        """What the network is told about noise levels: a fractional step of the unshifted table (time_input 'noise')
-        or of the shifted one ('index'). Any shape, float64."""
+        """The time that the network is given for noise levels: a fractional step of the unshifted table (time_input
+        'noise') or of the shifted one ('index'). Any shape, float64."""
         table = self.base_log_snr if self.config.time_input == "noise" else self.log_snr
         return _invert(table, log_snr.double())
 

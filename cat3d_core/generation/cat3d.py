@@ -31,8 +31,8 @@ def cat3d_spec(
 ) -> GeneratorSpec:
     """The spec of a model. advice: what its file recommends, of solver, nodes, steps and guidance (a number); the rest
     is as measured."""
-    told = dict(advice or {})
-    guidance = replace(MEASURED.guidance, scale=told.pop("guidance", MEASURED.guidance.scale))
+    advised = dict(advice or {})
+    guidance = replace(MEASURED.guidance, scale=advised.pop("guidance", MEASURED.guidance.scale))
     size = config.unet.latent_size
     return GeneratorSpec(
         views=config.views,
@@ -41,7 +41,7 @@ def cat3d_spec(
         latent_shape=(config.unet.latent_channels, size, size),
         identity=identity,
         encoder_identity=encoder_identity,
-        advice=replace(MEASURED, guidance=guidance, **told),
+        advice=replace(MEASURED, guidance=guidance, **advised),
         reference=replace(PAPER, guidance=replace(PAPER.guidance, scale=guidance.scale)),
         cost=partial(_cost, config),
         need=partial(multiview_need, config) if count_parameters(config.unet) > _LARGE else None,
@@ -103,5 +103,5 @@ class Cat3dGenerator:
 
 
 def _matrices(group: ViewGroup) -> Tensor:
-    """(M + N, 4, 4): what the network is told of the cameras, seen from the first given view."""
+    """(M + N, 4, 4): the cameras as the network takes them, seen from the first given view."""
     return reference_from_image(group.cameras, group.cameras.world_from_camera[0])

@@ -1,7 +1,7 @@
 """What every generator of views offers, and what it is asked: p(target views | given views, cameras), paper section 3.
 
-Cameras go in, not raymaps, and images beside latents: how a network is told of them is its own matter, and so are
-padding, batches and memory. Tensors come back on the CPU.
+Cameras go in, not raymaps, and images beside latents: how they enter a network is the generator's own matter, and so
+are padding, batches and memory. Tensors come back on the CPU.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ class GeneratorSpec:
     layout: how a plan groups views for it: "groups" as the paper does, or "windows", anchors along the path first and
     then what lies between them, with captured views in each (`cat3d_core.windows`). terms: what its licence says
     of what is made with it, in a sentence; empty: nothing that need be said. need(groups, dtype): memory of sampling so
-    many groups at once; None: so little that nobody asks.
+    many groups at once; None: so little that nobody asks. at(views, side): the spec with so many views at once, of
+    square images with sides of so many pixels, None: as it is; ValueError where that can't be. None: never.
     """
 
     views: int
@@ -52,6 +53,7 @@ class GeneratorSpec:
     layout: Literal["groups", "windows"] = "groups"
     terms: str = ""
     need: Callable[[int, torch.dtype], Need] | None = field(default=None, compare=False)
+    at: Callable[[int | None, int | None], GeneratorSpec] | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,10 @@ class ViewGroup:
 
 
 class Generator(Protocol):
-    """Encode, sample, decode. Methods take tensors from any device and give them back on the CPU."""
+    """Encode, sample, decode. Methods take tensors from any device and give them back on the CPU.
+
+    spec: where that has `at`, another one of those may be put in its place, for samples as that says.
+    """
 
     spec: GeneratorSpec
 

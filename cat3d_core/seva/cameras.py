@@ -1,4 +1,4 @@
-"""Where SEVA's network is told that its cameras stand: one scale for the scene, rays relative to a window's first view.
+"""The cameras as SEVA's network takes them: one scale for the scene, rays relative to a window's first view.
 
 Its own code takes another scale for each window; here the scale is that of the scene's first captured view, so that
 all windows speak of one scene in one unit.

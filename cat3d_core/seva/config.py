@@ -33,6 +33,8 @@ class SevaConfig:
                     f"{channels} channels can't be split into 32 norm groups and heads of {self.head_channels} "
                     f"channels."
                 )
+        if self.image_size % self.multiple or self.image_size <= 0:
+            raise ValueError(f"Images of {self.image_size} pixels a side are not multiples of {self.multiple}.")
 
 
 #: A network of a few hundred thousand weights with the names of the real one, for tests.

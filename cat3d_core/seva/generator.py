@@ -35,7 +35,7 @@ SECOND_PASS, LEAST = 2.0, 1.2
 def seva_spec(
     config: SevaConfig, identity: str = "", encoder_identity: str = "", beside: int | None = None
 ) -> GeneratorSpec:
-    """The spec of a network of SEVA's kind: windows of its trained number of square views of its trained size.
+    """The spec of a network of SEVA's kind: windows of the configuration's number of square views of its size.
 
     beside: bytes of the autoencoder's and the image tower's weights; None: those of the published ones."""
     size = config.image_size
@@ -53,7 +53,16 @@ def seva_spec(
         layout="windows",
         terms=LICENCE,
         need=partial(_need, config, beside),
+        at=partial(_at, config, identity, encoder_identity, beside),
     )
+
+
+def _at(
+    config: SevaConfig, identity: str, encoder_identity: str, beside: int | None, views: int | None, side: int | None
+) -> GeneratorSpec:
+    """The same weights for windows and images of other sizes: the network itself takes any."""
+    other = replace(config, views=views or config.views, image_size=side or config.image_size)
+    return seva_spec(other, identity, encoder_identity, beside)
 
 
 def _cost(config: SevaConfig, given: int, targets: int, sampler: SamplerConfig) -> Cost:
@@ -90,8 +99,8 @@ class SevaGenerator:
     def sample(self, groups: Iterable[ViewGroup], sampler: SamplerConfig) -> Iterator[Tensor]:
         """Latents of each group's targets (see `Generator.sample`).
 
-        Windows shorter than those it was trained on are filled up with further copies of their targets, longer ones
-        are taken as they are. A group's result is bit-identical with `micro_batch` 1. Raises ValueError for a group
+        Windows shorter than those of the spec are filled up with further copies of their targets, longer ones are
+        taken as they are. A group's result is bit-identical with `micro_batch` 1. Raises ValueError for a group
         without the images of its given views.
         """
         at_once = sampler.micro_batch or 1
@@ -117,7 +126,7 @@ class SevaGenerator:
         if group.images is None:
             raise ValueError("SEVA needs the images of the given views, not their latents alone.")
         given, targets = len(group.latents), len(group.noise)
-        copies = torch.arange(max(targets, self.model.config.views - given)) % targets
+        copies = torch.arange(max(targets, self.spec.views - given)) % targets
         cameras = scene_scale(_all_cameras(group)).cameras(group.cameras)
         cameras = cameras[[*range(given), *(given + copies).tolist()]]
         is_given = torch.arange(len(cameras)) < given

@@ -1,4 +1,4 @@
-"""What SEVA's network is told of a window as a whole: the mean CLIP embedding of the given views."""
+"""The one token by which SEVA's network knows what a window shows: the mean CLIP embedding of the given views."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ _RAY_CHANNELS = 6
 
 
 class Inputs(NamedTuple):
-    """What every block is told: time [G*V, C] after its SiLU, rays [G*V, 6, h, w], context [G*V, 1, C'], and V."""
+    """What every block is given: time [G*V, C] after its SiLU, rays [G*V, 6, h, w], context [G*V, 1, C'], and V."""
 
     time: Tensor
     rays: Tensor

@@ -27,7 +27,7 @@ LOWERED = 4.8
 
 
 class SevaSchedule(Schedule):
-    """Noise levels are always entries of the table, as the network is told their index."""
+    """Noise levels are always entries of the table, since the network is given their index."""
 
     def __init__(self) -> None:
         super().__init__(_CONFIG, targets=1)

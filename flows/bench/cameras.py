@@ -179,7 +179,7 @@ def focal(random, poses, known):
     return poses, _rays(known, set(known.found), lambda rays: rays * factor), set(range(len(poses)))
 
 
-@damage("a lens's distortion is not told (k1 of -0.3 to -0.1)")
+@damage("a lens's distortion is left out (k1 of -0.3 to -0.1)")
 def bent(random, poses, known):
     k1 = float(random.uniform(-0.3, -0.1))
     views = set(known.found)

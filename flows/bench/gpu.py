@@ -52,7 +52,7 @@ def job(name: str, preset: str, rays: int, size: int, seconds: float, device: st
     }
     if device == "cuda":
         row["peak_gib"] = torch.cuda.max_memory_allocated() / 2**30
-    if row["seconds_of_all_steps"] <= seconds:  # worth a whole one, for what it is worth
+    if row["seconds_of_all_steps"] <= seconds:
         row |= train_and_measure(config, train, test, depths, device)
     return row
 

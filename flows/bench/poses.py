@@ -70,7 +70,7 @@ def as_markdown(rows: list[dict[str, Any]]) -> str:
     for r in rows:
         head = f"| {r['scene']} | {r['views']} | {r['features']} | {r['registered']} |"
         if r["registered"] == 0:
-            lines.append(f"{head} failed, and said so | | | | {r['seconds']:.0f} |")
+            lines.append(f"{head} refused with a message | | | | {r['seconds']:.0f} |")
         else:
             lines.append(
                 f"{head} {r['attempt']} | {r['rotation_deg_median']:.2f} / {r['rotation_deg_max']:.2f} "

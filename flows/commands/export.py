@@ -128,8 +128,8 @@ def _surface_exports(source: Source, kinds: set[str], out: Path, settings: Surfa
         made += [out / "mesh.ply", out / "mesh.glb"]
     if "splats" in kinds:
         splats = splats_of(source.scene, renders, cameras, settings.splats, settings.refine)
-        files, told = write_splats(out, splats, source.frame_from_scene)
-        console.print(f"splats: {len(splats)} from {len(cameras)} views", *told)
+        files, lacking = write_splats(out, splats, source.frame_from_scene)
+        console.print(f"splats: {len(splats)} from {len(cameras)} views", *lacking)
         made += files
     if kinds & {"points", "dataset"}:
         cloud = _mapped(point_cloud(renders, cameras, **shown), source)

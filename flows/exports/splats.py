@@ -50,13 +50,13 @@ def splats_of(
 def write_splats(folder: Path, gaussians: Gaussians, frame_from_scene: Similarity) -> tuple[list[Path], list[str]]:
     """Write splats.ply, splats.splat and splats.spz in the frame asked for; the files made, and why others were not."""
     mapped = gaussians.mapped(frame_from_scene)
-    made, told = [], []
+    made, lacking = [], []
     for suffix, write in WRITERS.items():
         path = folder / f"splats{suffix}"
         try:
             write(path, mapped)
         except InputError as error:
-            told.append(str(error))
+            lacking.append(str(error))
         else:
             made.append(path)
-    return made, told
+    return made, lacking

@@ -44,15 +44,27 @@ class Format(Protocol):
 
 
 def generator_spec(job: Job) -> GeneratorSpec:
-    """What the job's generator is, without loading it. Raises InputError for a model that can't be used."""
+    """What the job's generator is, without loading it, for windows and images of the sizes that the plan asks for.
+    Raises InputError for a model that can't be used, or not with them."""
     name, path = _kind(job)
-    return _described(name, path, _changed(path))
+    spec, plan = _described(name, path, _changed(path)), job.config.plan
+    if spec.at is None:
+        if plan.window is not None:
+            raise InputError(f"plan.window is set, but the generator {name} always takes {spec.views} views at once.")
+        return spec
+    try:
+        return spec.at(plan.window, plan.image_size)
+    except ValueError as error:
+        raise InputError(f"plan.window, plan.image_size: {error}") from None
 
 
 def open_generator(job: Job) -> Generator:
     """The job's generator on this process's device; loaded once a process. Raises InputError."""
     name, path = _kind(job)
-    return _loaded(name, path, _changed(path), device(), job.config.sample.precision)
+    generator, spec = _loaded(name, path, _changed(path), device(), job.config.sample.precision), generator_spec(job)
+    if generator.spec != spec:
+        generator.spec = spec
+    return generator
 
 
 def forget_generator() -> None:

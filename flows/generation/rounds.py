@@ -64,7 +64,7 @@ class Rounds(OneRound):
     def __iter__(self) -> Iterator[list[list[int]]]:
         if len(self.train) < 2 or not self.passes:
             if self.passes:
-                self.decisions.append(decided("Sampled in one round: of one captured view none can be held out."))
+                self.decisions.append(decided("Sampled in one round: a single captured view cannot be held out."))
             yield self.passes
             return
         if (1 - SHARE) * self.flops < BRIEF_FIELDS * BRIEF_FLOPS:
@@ -82,15 +82,15 @@ class Rounds(OneRound):
             sampled = [*self.kept, *(g for items in anchors for g in items), *chosen]
             brief = self.brief(sampled)
             after = self.held_out_psnr(brief)
-            told = f"Round {number}: with {len(chosen)} more groups the held-out captured view went from "
-            told += f"{before:.2f} dB to {after:.2f} dB"
+            change = f"Round {number}: with {len(chosen)} more groups the held-out captured view went from "
+            change += f"{before:.2f} dB to {after:.2f} dB"
             if after >= before:
                 self.kept = sampled
             if after - before < GAIN_DB:
                 used = "" if after >= before else "; its views are not used"
-                self.decisions.append(decided(f"{told}, which is less than {GAIN_DB:g} dB more{used}."))
+                self.decisions.append(decided(f"{change}, which is less than {GAIN_DB:g} dB more{used}."))
                 break
-            self.decisions.append(decided(f"{told}."))
+            self.decisions.append(decided(f"{change}."))
             left = [g for g in rest if g not in self.kept]
             unknown = {g: self.unknown(brief, g) for g in left}
             chosen = sorted(sorted(left, key=lambda g: (-unknown[g], g))[:size])

@@ -30,7 +30,7 @@ from schemas.errors import ConfigError
 
 @dataclass(frozen=True)
 class Prompt:
-    """What is asked for. pipeline: a folder as diffusers writes it; None: as the pipeline does without being told."""
+    """What is asked for. pipeline: a folder as diffusers writes it; None: the pipeline's own default."""
 
     text: str
     pipeline: Path

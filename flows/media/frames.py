@@ -25,8 +25,8 @@ SHARPNESS_WIDTH = 480
 
 def video_length(path: Path) -> tuple[float, float]:
     """(seconds, frames a second) of a video, by its header. Raises InputError for a file that is no video."""
-    told = subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-i", f"file:{path}"], capture_output=True)
-    text = told.stderr.decode("utf-8", "replace")
+    probe = subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-i", f"file:{path}"], capture_output=True)
+    text = probe.stderr.decode("utf-8", "replace")
     length = re.search(r"Duration: (\d+):(\d+):([\d.]+)", text)
     rate = re.search(r"Video:.*?([\d.]+)(k?) (?:fps|tbr)", text)
     if not length or not rate:

@@ -1,4 +1,4 @@
-"""What `cat3d inspect STORE` tells: the tree, how complete each stage is, the cameras, what is stale, what is damaged.
+"""What `cat3d inspect STORE` shows: the tree, how complete each stage is, the cameras, what is stale, what is damaged.
 
 `inspect_store` gives a dictionary for machines; `inspect_text.py` prints it for people. Reading only; a store may be
 written meanwhile, and then what is seen is a moment of it.

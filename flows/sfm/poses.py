@@ -94,7 +94,7 @@ def estimate_poses(
     progress = on_progress or (lambda step, done, total: None)
     if len(photos) == 1:
         return _single_image(photos[0], names)
-    pycolmap.logging.minloglevel = 3  # its warnings are about single pairs; failures are told here
+    pycolmap.logging.minloglevel = 3  # its warnings are about single pairs; failures are reported here
     with tempfile.TemporaryDirectory(prefix="cat3d-poses-") as temporary:
         folder = Path(work_dir or temporary)
         folder.mkdir(parents=True, exist_ok=True)

@@ -32,7 +32,7 @@ MEASURED = ("psnr_db", "ssim", "lpips", "clip_score", "depth_abs_rel", "surface_
 
 
 def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
-    """Of the renders those of held-out views alone, so that a new path changes no number; which networks this machine
+    """Of the renders only those of held-out views, so that a new path changes no number; which networks this machine
     has, which decides their columns; metrics that were added."""
     test = {"views": job.view_names("test"), "rendered": job.config.render.test_views}
     found: dict[str, Any] = {

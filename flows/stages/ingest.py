@@ -32,8 +32,8 @@ class Ingested(NamedTuple):
 
 
 def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
-    """The photos and their lens; where cameras are estimated though there are some, the pose stage writes other images
-    over these."""
+    """The photos and their lens; where cameras are estimated although the source has some, the pose stage writes other
+    images over these."""
     found = {name: job.scene.digests[name] for name in ("images", "lens")}
     return found | ({"estimate": "always"} if job.config.poses.estimate == "always" else {})
 

@@ -130,7 +130,7 @@ STAGE = Stage(
     execute,
     version=1,
     reads=("poses",),
-    settings=settings_of("plan", "seed", without=("image_size",)),
+    settings=settings_of("plan", "seed", without=("image_size", "window")),
     inputs=inputs,
     wanted=generates,
 )

@@ -51,7 +51,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
             made = render_views(run.renders(kind), scene, cameras, views, _field_key(job, store), progress)
             rendered, rays = rendered + len(made), rays + sum(made)
     if rendered < total:
-        text = f"Skipped {total - rendered} of {total} renders: they are of this field and these cameras."
+        text = f"Skipped {total - rendered} of {total} renders: those of this field and these cameras are there."
         decisions.append(skipped(text, views=total - rendered))
     write_pictures(job, run, test)
     return Outcome({"views": rendered, "rays": rays}, decisions)

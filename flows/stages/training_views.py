@@ -91,8 +91,8 @@ def unseen_alone(job: Job, views: Views) -> tuple[Views, list[Decision]]:
     shown = shown_by_captured(job, views)
     share = float(shown.sum() / views.size[~views.captured].prod(-1).sum())
     text = (
-        f"{share:.0%} of the pixels of generated views were not trained on, since {LEAST} captured views show their "
-        f"places as well: so says a field of those alone ({time.monotonic() - started:.0f} s). At least as large a "
-        "share of the rays is theirs."
+        f"{share:.0%} of the pixels of generated views were not trained on: {LEAST} captured views show their places "
+        f"too, by a brief reconstruction of those views ({time.monotonic() - started:.0f} s). They get at least that "
+        "share of the rays."
     )
     return views.only(~shown), [skipped(text, "seen", pixels=int(shown.sum()))]

@@ -90,7 +90,7 @@ def render_shards(
     advance: Callable[[int], None],
     with_depth: bool = False,
 ) -> None:
-    """Render the shards `mine` that are not there yet, families in turn. `advance` is told of scenes done."""
+    """Render the shards `mine` that are not there yet, families in turn. `advance` is called with numbers of scenes."""
     for shard in mine:
         path = folder / "renders" / f"{shard:05d}.safetensors"
         numbers = range(shard * SHARD_SCENES, min((shard + 1) * SHARD_SCENES, scenes))

@@ -169,5 +169,5 @@ class Session:
         self.panel.beside(view, rendered)
 
     def say(self, text: str) -> None:
-        """A sentence for the one who looks."""
+        """Show a sentence to the user."""
         self.client.add_notification("cat3d", text, auto_close_seconds=10.0)

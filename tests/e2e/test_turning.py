@@ -26,7 +26,7 @@ SIZE = 320, 200
 
 def scene() -> Gaussians:
     g = gaussians(400, seed=4).to(dtype=torch.float32)
-    return Gaussians(g.means, g.quaternions, g.log_scales, g.logits, 0.5 * g.harmonics)
+    return Gaussians(g.means, g.quaternions, g.log_scales, g.logits, 2.0 * g.harmonics)
 
 
 def camera() -> Cameras:

@@ -35,14 +35,14 @@ def describe(path: Path | None) -> GeneratorSpec:
     try:
         return cat3d_spec(from_dict(ModelConfig, facts["config"]), facts["sha256"], facts["encoder_sha256"], advice)
     except TypeError as error:
-        raise ValueError(f"{path} recommends a sampler with settings that there are none of: {error}.") from None
+        raise ValueError(f"{path} recommends a sampler with settings that don't exist here: {error}.") from None
 
 
 def load(path: Path | None, device: str, precision: str) -> Cat3dGenerator:
     """The model on `device`, checked against its hash; `precision` is the U-Net's, the autoencoder stays in float32.
 
     Raises ValueError for a file that is damaged or no such model."""
-    # Cameras are told in float64.
+    # The network computes relative cameras in float64.
     model = load_model(_file(path), exact_device() if device == "mps" else device)
     model.unet.to(getattr(torch, precision))
     return Cat3dGenerator(model, describe(path))

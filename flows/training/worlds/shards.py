@@ -67,7 +67,7 @@ def world_shards(
     advance: Callable[[int], None], first: int = 0,
 ) -> None:  # fmt: skip
     """Photograph the shards `mine` that are not in `folder`/renders yet, tracks in turn; shard n becomes file
-    `first` + n. `advance` is told of groups done.
+    `first` + n. `advance` is called with the number of groups done.
 
     Where a track has no room for a single group, the next one takes its turn. Raises InputError where none has."""
     for shard in mine:

@@ -110,7 +110,7 @@ def _ldm_names(weights):
 
 
 def test_single_file_in_the_original_layout(tmp_path):
-    """Heads are told from shapes here: 8 for SD1's convolutional projections."""
+    """Heads follow from shapes here: 8 for SD1's convolutional projections."""
     oracle = _oracle(SD1)
     weights = {k: v.contiguous() for k, v in _ldm_names(oracle.state_dict()).items()}
     assert len(weights) == len(oracle.state_dict())

@@ -19,7 +19,8 @@ from flows.commands.models import model_report
 from flows.commands.run import run_command
 from flows.errors import InputError
 from flows.generation.formats import seva
-from flows.generation.open import recognised
+from flows.generation.open import generator_spec, open_generator, recognised
+from flows.generation.opening import opening
 from flows.generation.plan import read_plan
 from flows.jobs import device
 from flows.jobs.request import make_request
@@ -141,6 +142,26 @@ def test_settings_that_windows_do_not_have_are_refused(cat3d, model: Path, tmp_p
                  "--set", "plan.group_size=2", check=False)  # fmt: skip
     assert done.returncode == 1
     assert "plan.group_size is set, but this generator's windows of 8 views" in " ".join(done.stderr.split())
+
+
+def test_windows_and_images_of_other_sizes_are_planned_for(model: Path, tmp_path: Path) -> None:
+    """What the plan asks for is the generator's too; a network of one size refuses it."""
+    settings = ["plan={window: 6, image_size: 128}"]
+    (job,) = make_request(SCENE, tmp_path, "3", {"method": "cat3d", "model": str(model)}, settings=settings).jobs()
+    spec = generator_spec(job)
+    assert (spec.views, spec.image_size, spec.latent_shape) == (6, (128, 128), (4, 16, 16))
+    assert spec.identity == seva.describe(model).identity
+    assert "of 6 views at once" in opening(job)[1]
+    assert open_generator(job).spec == spec
+    (job,) = make_request(SCENE, tmp_path, "3", {"method": "cat3d", "model": str(model)}, settings=[]).jobs()
+    assert open_generator(job).spec.views == 8
+    (odd,) = make_request(SCENE, tmp_path, "3", {"method": "cat3d", "model": str(model)},
+                          settings=["plan.image_size=100"]).jobs()  # fmt: skip
+    with pytest.raises(InputError, match="plan.image_size: Images of 100 pixels a side are not multiples of 64"):
+        generator_spec(odd)
+    (ours,) = make_request(SCENE, tmp_path, "3", {"method": "cat3d"}, settings=["plan.window=6"]).jobs()
+    with pytest.raises(InputError, match="plan.window is set, but the generator cat3d always takes 8 views at once"):
+        generator_spec(ours)
 
 
 def test_the_device_is_what_there_is_or_what_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from flows.jobs.job import Job
 from flows.jobs.request import Request, make_config
 from flows.pipeline.runner import opened, run_missing
 from flows.reporting.report import scene_section, skipped_work, write_report
+from flows.stages import match as match_stage
 from flows.stages import plan as plan_stage
 from flows.stages import sample as sample_stage
 from schemas.decisions import Decision
@@ -27,7 +28,7 @@ TRAINING = (
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
-    """Of three runs of one scene in which each switch acts at least once, as some exclude each other. The second path
+    """Of four runs of one scene in which each switch acts at least once, as some exclude each other. The second path
     of the first is the first one again, which adds nothing to the coverage."""
     out = tmp_path_factory.mktemp("skipped")
     model = random_model(out / "tiny.safetensors")
@@ -60,6 +61,8 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
         )
         patch.setattr("flows.generation.rounds.BRIEF_FLOPS", 0.0)
         run("rounds", "sample", none | {"rounds": True}, "plan.views=20", "sample.steps=2")
+        patch.setattr(match_stage, "UNEXPLAINED_SHARE", 1.0)
+        run("explained", "sample", none | {"explained": True}, "plan.views=5", "sample.steps=2", "hints.use=always")
         patch.setattr(plan_stage, "COVERED_SHARE", 0.0)
         job = run("covered", "plan", none | {"covered_path": True}, "plan.views=20")
     write_report(out)

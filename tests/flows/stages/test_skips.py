@@ -218,7 +218,7 @@ def test_rounds_stop_when_the_held_out_view_no_longer_improves(model: Path, tmp_
 def test_one_photo_is_sampled_in_one_round(model: Path, tmp_path: Path) -> None:
     one = job(tmp_path, model, "skip={rounds: true}", split="1")
     told = texts(run_stages(one, *UP_TO_FIELD[:-1])["sample"])
-    assert "Sampled in one round: of one captured view none can be held out." in told
+    assert "Sampled in one round: a single captured view cannot be held out." in told
 
 
 def test_groups_near_captured_views_take_half_of_the_steps(model: Path, tmp_path: Path, monkeypatch) -> None:
@@ -271,7 +271,7 @@ def test_generated_views_are_no_finer_than_the_photos_and_it_is_said(model: Path
 def test_what_captured_views_show_is_not_learned_from_generated_ones(model: Path, tmp_path: Path) -> None:
     one = job(tmp_path, model, "skip={seen: true, covered_path: false, coverage: false}")
     records = run_stages(one, *UP_TO_FIELD)
-    told = next(d for d in texts(records["reconstruct"]) if "captured views show their" in d)
+    told = next(d for d in texts(records["reconstruct"]) if "captured views show their places" in d)
     store = SceneStore.open(one.store_path)
     views, _ = training_views(one, store, store.run(one.run))
     share = left_out(views)
