@@ -23,19 +23,21 @@ from tests.e2e.browser import Browser, Tab, chromium, free_port, until
 
 SCENE = "procedural:co3d/1?views=12&width=48&height=36"
 SPLATS, FIELD = "vall-splats", "vall-zipnerf"
-WINDOW = 900, 600
+WINDOW = 800, 480
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scene reconstructed twice, made without a server."""
     out = tmp_path_factory.mktemp("view")
-    common = ["reconstruct.preset=tiny", "render.path_views=2"]
-    for method, run in (("splats", SPLATS), ("zipnerf", FIELD)):
-        config = make_config({"method": "zipnerf"}, None, [f"reconstruct.method={method}", *common])
+    fields = "{iterations: 40, batch_rays: 256, samples: [8, 8], grid_max: [32, 64], grid_features: [1, 2], " \
+        "interlevel_blur: [0.03], grid_log2_table: 12, warmup_iterations: 4, lpips_weight: 0.0}"  # fmt: skip
+    for method, run, overrides in (("splats", SPLATS, "{iterations: 20}"), ("zipnerf", FIELD, fields)):
+        settings = [f"reconstruct.method={method}", f"reconstruct.overrides={overrides}", "reconstruct.preset=tiny"]
+        config = make_config({"method": "zipnerf"}, None, settings)
         [job] = Request(SCENE, out, ("all",), config).jobs()
         with opened(job):
-            run_missing(job, until="evaluate")
+            run_missing(job, until="reconstruct")
         assert job.run == run
     return job.store_path
 
