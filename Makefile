@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DEMO_OUT ?= outputs/demo
 DEMO_ARGS ?=
 
-.PHONY: demo test test-slow lint docs figures setup clean
+.PHONY: demo test test-slow lint docs figures peers setup clean
 
 setup: $(VENV)/.installed
 
@@ -38,6 +38,10 @@ figures: setup
 	$(BIN)/cat3d sweep infra/docs/showcase.yaml --out outputs/showcase
 	$(BIN)/cat3d sweep infra/docs/quality.yaml --out outputs/quality
 	$(BIN)/python -m infra.docs.figures --showcase outputs/showcase --sweep outputs/quality
+
+# Programs of others, in an environment of their own, for `cat3d bench peers`. Nothing else needs it.
+peers:
+	PYTHON=$(PYTHON) sh infra/peers.sh
 
 clean:
 	rm -rf $(VENV) outputs build *.egg-info

@@ -54,6 +54,43 @@ def test_generated_pages_are_what_the_code_says() -> None:
     assert not stale(), f"Write them with `make docs`: {stale()}"
 
 
+@pytest.mark.parametrize("page", [p for p in PAGES if p not in FREE], ids=lambda p: str(p.relative_to(ROOT)))
+def test_commands_and_options_of_the_documents_exist(page: Path) -> None:
+    """Every `cat3d NAME --option`, and every setting of a run that is given by --set."""
+    import typer
+
+    from flows.cli import app
+
+    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    wrong = []
+    for name, rest in re.findall(r"(?:^    |`)cat3d ([a-z-]+)([^`#\n]*)", page.read_text(), re.M):
+        if name not in commands:
+            wrong.append(f"cat3d {name}")
+            continue
+        known = {
+            option for parameter in commands[name].params for option in (*parameter.opts, *parameter.secondary_opts)
+        }
+        options = re.findall(r"(?<!\S)--?[a-z][a-z-]*", rest)
+        wrong += [f"cat3d {name} {option}" for option in options if option not in known]
+        if name in ("run", "plan", "reprocess"):
+            wrong += [f"--set {path}" for path in re.findall(r"--set ([\w.]+)=", rest) if not is_setting(path)]
+    assert not wrong, f"{page.relative_to(ROOT)}: {wrong}"
+
+
+def is_setting(path: str) -> bool:
+    """Whether a run has the setting; below a field that holds a mapping anything may stand."""
+    from schemas.config import RunConfig
+
+    model = RunConfig
+    for part in path.split("."):
+        if not hasattr(model, "model_fields"):
+            return True
+        if part not in model.model_fields:
+            return part == "method"  # the short name of `generate`
+        model = model.model_fields[part].annotation
+    return True
+
+
 def prose(page: Path) -> list[str]:
     """Lines of a page outside of code blocks, tables and comments, which hold what programs wrote."""
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.M | re.S)

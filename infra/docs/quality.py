@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from flows.reporting.published import PUBLISHED
-from flows.reporting.summary import summary_rows, timing_rows
+from flows.reporting.summary import summary_rows
+from infra.docs.reference import wrapped
 from schemas.documents import write_bytes
 from schemas.tables import TIMINGS, read_rows
 
@@ -16,8 +17,14 @@ START, END = "<!-- quality: written by make figures -->", "<!-- end of quality -
 #: Methods compared: the reconstructor on the photos alone, and with generated views.
 BASELINE, GENERATED = "zipnerf", "cat3d"
 SPLIT = "3"
-#: The paper's name of a data set that is shortened here.
-PAPER_NAMES = {"re10k": "realestate10k", "mip360": "mipnerf360"}
+#: A family of scenes -> what its scenes are like, and the paper's name of the data set that it stands for.
+FAMILIES = {
+    "co3d": ("one object, from all around", "co3d"),
+    "dtu": ("objects on a table, from one side", "dtu"),
+    "llff": ("things before a wall, from the front", "llff"),
+    "mipnerf360": ("open land, from all around", "mipnerf360"),
+    "realestate10k": ("a room, walked through", "realestate10k"),
+}
 
 
 def write_table(page: Path, sweep: Path) -> None:
@@ -37,11 +44,12 @@ def table(sweep: Path) -> str:
     datasets = [d for d in sorted({d for d, _ in found}) if found.get((d, BASELINE)) and found.get((d, GENERATED))]
     if not datasets:
         raise ValueError(f"{sweep} has no data set with {SPLIT} views of both {BASELINE} and {GENERATED}.")
-    lines = ["| scene | photos alone | with generated views | gain | the paper's gain |", "|---|---|---|---|---|"]
+    lines = ["| procedural scene | photos alone | with generated views | gain | the paper's |", "|---|---|---|---|---|"]
     for dataset in datasets:
         alone, generated = (_by_seed(found[dataset, m]) for m in (BASELINE, GENERATED))
         gain = statistics.mean(generated) - statistics.mean(alone)
-        cells = [dataset, _cell(alone), _cell(generated), f"{gain:+.1f}", _paper(dataset)]
+        name, published = FAMILIES.get(dataset, (dataset, dataset))
+        cells = [name, _cell(alone), _cell(generated), f"{gain:+.1f}", _paper(published)]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join([*lines, "", *_caption(sweep, found)])
 
@@ -57,23 +65,31 @@ def _cell(seeds: list[float]) -> str:
 
 
 def _paper(dataset: str) -> str:
-    name = PAPER_NAMES.get(dataset, dataset)
-    known = {p["method"]: p["psnr_db"] for p in PUBLISHED if p["dataset"] == name and p["split"] == SPLIT}
+    """The paper's gain on the data set that the family stands for; empty where there is none."""
+    known = {p["method"]: p["psnr_db"] for p in PUBLISHED if p["dataset"] == dataset and p["split"] == SPLIT}
     if not {"CAT3D", "Zip-NeRF*"} <= known.keys():
         return ""
     return f"{round(known['CAT3D'] - known['Zip-NeRF*'], 3):+.1f}"
 
 
 def _caption(sweep: Path, found: dict[Any, Any]) -> list[str]:
+    """What the numbers are of, in lines of at most 100 characters."""
     seeds = max(len(values) for values in found.values())
+    scenes = max(len(of_seed) for values in found.values() for of_seed in values.values())
     dates = sorted({row["started_at"].date().isoformat() for row in read_rows(sweep / "timings", TIMINGS).to_pylist()})
-    minutes = sum(row["total"] for row in timing_rows(sweep)) / 60
-    over = f"± is the standard deviation over {seeds} seeds" if seeds > 1 else "one seed, so without ±"
-    return [
-        f"PSNR in dB of held-out views with three photos; {over}.",
-        f"Sweep `{_name(sweep)}` of {dates[-1]}, {minutes:.0f} minutes of its stages in all. The paper's gain",
-        "is CAT3D over Zip-NeRF\\* in its Table 1: other scenes, larger images and a larger model.",
-    ]
+    over = f"± is the standard deviation over {_words(seeds, 'seed')}" if seeds > 1 else "one seed, so without ±"
+    text = (
+        f"PSNR in dB of held-out views with three photos, {_words(scenes, 'scene')} a row; {over}. Sweep "
+        f"`{_name(sweep)}` of {dates[-1]}. The paper's gain is that of CAT3D over Zip-NeRF\\* in its Table 1 on "
+        "the data set that the scene resembles: captured scenes, larger images, a larger model."
+    )
+    return wrapped(text)
+
+
+def _words(count: int, of: str) -> str:
+    """A small number in words, as prose has it."""
+    numbers = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
+    return f"{numbers[count] if count < len(numbers) else count} {of}{'s' * (count != 1)}"
 
 
 def _name(sweep: Path) -> str:
