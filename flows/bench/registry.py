@@ -205,7 +205,7 @@ def splat_rows(quick: bool, data: Path | None) -> list[Row]:
         return rows + splats.method_rows(families, (3,), (0,), (("splats", "tiny"),), size=32)
     rows = splats.kernel_rows() + splats.conversion_rows(splats.procedural_scenes())
     if data is not None:
-        rows += splats.conversion_rows(splats.captured_scenes(_scenes(data, list(scenes.DOWNSCALE))))
+        rows += splats.conversion_rows(splats.captured_scenes(scenes_of(data, list(scenes.DOWNSCALE))))
     return rows + splats.method_rows()
 
 
