@@ -92,9 +92,8 @@ class PlanConfig(_Model):
 class SampleConfig(_Model):
     """Sampling views from the diffusion model (paper, section 3.1).
 
-    solver, nodes, steps, guidance: None takes what the model's file recommends (a briefly trained model is at its best
-    after few steps without guidance), else the point on the measured front: unipc, log_snr, 10 steps, guidance 3.
-    """
+    solver, nodes, steps, guidance: None takes what the model's file recommends, else the point on the measured front:
+    unipc, log_snr, 10 steps, guidance 3."""
 
     generator: str | None = None
     """Generator: "cat3d", "seva", or that of an installed package; None: the one that recognises the checkpoint."""
@@ -109,8 +108,9 @@ class SampleConfig(_Model):
     guidance: NonNegativeFloat | None = None
     """Classifier-free guidance weight."""
     guidance_log_snr: tuple[FiniteFloat | None, FiniteFloat | None] | None = None
-    """Lowest and highest log-SNR at which guidance is on, where `skip.guidance` is; a bound of None: no bound.
-    None: up to 2, the interval on the measured front."""
+    """Lowest and highest log-SNR with guidance, under `skip.guidance`; a bound of None: none. None: up to 2."""
+    start: Literal["noise", "hint"] = "noise"
+    """From noise (paper) or, for models that take hints, later, from what the photos show of the view."""
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """Of the network; the sampler's state is float32 always. bfloat16 and float16 are for GPUs."""
 

@@ -122,3 +122,30 @@ def test_readme_is_short_and_shows_pictures() -> None:
     assert len(pictures) >= 5
     assert all(picture.stat().st_size < PICTURE_BYTES for picture in pictures)
     assert not re.findall(r"!\[\]", readme.read_text()), "every picture has alternative text"
+
+
+def test_readmes_table_of_quality(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Means over scenes, deviation over seeds, gain, and what the numbers are of; nothing of other splits."""
+    from infra.docs import quality
+
+    def row(method: str, seed: int, psnr: float, split: str = "3") -> dict[str, object]:
+        return {
+            "dataset": "llff",
+            "method": method,
+            "split": split,
+            "seed": seed,
+            "protocol": "google",
+            "psnr_db": psnr,
+        }
+
+    rows = [row("zipnerf", 0, 20.0), row("zipnerf", 1, 22.0), row("cat3d", 0, 24.0), row("cat3d", 1, 25.0)]
+    rows += [row("cat3d", 0, 99.0, "6"), row("other", 0, 99.0)]
+    monkeypatch.setattr(quality, "summary_rows", lambda _: rows)
+    monkeypatch.setattr(quality, "_last_day", lambda _: "2026-11-28")
+    text = quality.table(tmp_path)
+    assert "| things before a wall, from the front | 21.0 ± 1.4 | 24.5 ± 0.7 | +3.5 | +4.3 |" in text
+    prose = " ".join(text.split("\n\n")[1].split())
+    assert "one scene a row; ± is the standard deviation over two seeds" in prose
+    rows[:] = rows[:2]
+    with pytest.raises(ValueError, match="no data set with 3 views of both zipnerf and cat3d"):
+        quality.table(tmp_path)

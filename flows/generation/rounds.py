@@ -110,7 +110,7 @@ class Rounds(OneRound):
         shown = [v for v in self.train if v != self.held_out]
         cameras, images = read_cameras(self.store.captured, shown), read_images(self.store.captured, shown)
         run = self.store.run(self.job.run)
-        generator, explained = open_generator(self.job), explained_views(run)
+        generator, explained = open_generator(self.job), explained_views(self.job, run)
         windows = self.plan.plan.window.tolist()
         for view in (v for g in groups for v in self.plan.groups[g].targets):
             made = to_uint8(finished(self.job, generator, run, view, bool(explained[view]))[0])

@@ -14,7 +14,7 @@ from flows.jobs.stage import Stage, settings_of
 from flows.progress import meter
 from flows.reconstruction.open import open_reconstructor
 from flows.reconstruction.stored import Checkpoint, write_reconstruction
-from flows.stages.training_views import training_views
+from flows.stages.training_views import ENOUGH, training_views
 from schemas.decisions import Decision, skipped
 from schemas.scene_store import SceneStore
 
@@ -27,7 +27,8 @@ def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
     """The training views, the reconstructor's settings in full, and what decides which pixels are trained on: a changed
     preset or rule makes old fields stale."""
     skip = job.config.skip
-    found = {"train": job.view_names("train"), "detail": skip.detail, "seen": skip.seen}
+    seen = ENOUGH if skip.seen and job.generates else skip.seen
+    found = {"train": job.view_names("train"), "detail": skip.detail, "seen": seen}
     return found | dict(open_reconstructor(job).settings)
 
 

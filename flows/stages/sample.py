@@ -45,7 +45,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     run = store.run(job.run)
     run.generated.set_attrs(terms=generator_spec(job).terms)
     plan = StoredPlan(store, run, job.config.seed)
-    explained = explained_views(run)
+    explained = explained_views(job, run)
     rounds = Rounds(job, store, plan, sampling_flops(job, plan)) if job.config.skip.rounds else OneRound(plan)
     totals, groups, spared = Totals(), [], set(range(len(plan.groups)))
     for planned in rounds:
@@ -145,7 +145,7 @@ def sampler_decisions(job: Job, plan: StoredPlan, groups: Sequence[int]) -> list
 def work(job: Job, store: SceneStore, key: str, items: Sequence[int]) -> None:
     """A worker's share: sample the groups `items`, in order, and store the views of each as soon as they are there."""
     run = store.run(job.run)
-    plan = StoredPlan(store, run, job.config.seed)
+    plan = StoredPlan(store, run, job.config.seed, job.hinted)
     keys = view_keys(key, len(plan))
     generator = open_generator(job)
     targets = [view for g in items for view in plan.groups[g].targets]

@@ -76,14 +76,18 @@ def _caption(sweep: Path, found: dict[Any, Any]) -> list[str]:
     """What the numbers are of, in lines of at most 100 characters."""
     seeds = max(len(values) for values in found.values())
     scenes = max(len(of_seed) for values in found.values() for of_seed in values.values())
-    dates = sorted({row["started_at"].date().isoformat() for row in read_rows(sweep / "timings", TIMINGS).to_pylist()})
     over = f"± is the standard deviation over {_words(seeds, 'seed')}" if seeds > 1 else "one seed, so without ±"
     text = (
         f"PSNR in dB of held-out views with three photos, {_words(scenes, 'scene')} a row; {over}. Sweep "
-        f"`{_name(sweep)}` of {dates[-1]}. The paper's gain is that of CAT3D over Zip-NeRF\\* in its Table 1 on "
+        f"`{_name(sweep)}` of {_last_day(sweep)}. The paper's gain is that of CAT3D over Zip-NeRF\\* in its Table 1 on "
         "the data set that the scene resembles: captured scenes, larger images, a larger model."
     )
     return wrapped(text)
+
+
+def _last_day(sweep: Path) -> str:
+    """The day of its last stage."""
+    return max(row["started_at"].date().isoformat() for row in read_rows(sweep / "timings", TIMINGS).to_pylist())
 
 
 def _words(count: int, of: str) -> str:

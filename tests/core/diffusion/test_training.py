@@ -38,7 +38,7 @@ def test_loss_is_on_targets_only_with_clean_conditioning():
     seen = {}
 
     class Spy(torch.nn.Module):
-        def forward(self, x, time, cameras, mask):
+        def forward(self, x, time, cameras, mask, hints=None):
             seen.update(x=x, mask=mask, cameras=cameras)
             out = torch.zeros_like(x)
             out[:, :3] = 1e6  # whatever the network says about conditioning views does not count

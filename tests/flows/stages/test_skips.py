@@ -268,7 +268,9 @@ def test_generated_views_are_no_finer_than_the_photos_and_it_is_said(model: Path
     assert len(reduced.pixels) < len(whole.pixels)
 
 
-def test_what_captured_views_show_is_not_learned_from_generated_ones(model: Path, tmp_path: Path) -> None:
+def test_what_captured_views_show_is_not_learned_from_generated_ones(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     one = job(tmp_path, model, "skip={seen: true, covered_path: false, coverage: false}")
     records = run_stages(one, *UP_TO_FIELD)
     told = next(d for d in texts(records["reconstruct"]) if "captured views show their places" in d)
@@ -283,6 +285,13 @@ def test_what_captured_views_show_is_not_learned_from_generated_ones(model: Path
     most = views.only(views.captured.repeat_interleave(views.size.prod(-1)) | (torch.rand(len(views.pixels)) < 0.1))
     assert left_out(most) > 0.85
     assert fitted(trainer_config(one), most, {})[0].captured_share == left_out(most)
+    monkeypatch.setattr("flows.stages.training_views.ENOUGH", share - 0.01)
+    alone, decisions = training_views(one, store, store.run(one.run))
+    assert len(alone) == 3, "captured views show most of what the generated ones do: these are left out"
+    assert alone.valid is alone.weight is None, "and the captured ones are trained on as without them"
+    assert torch.equal(alone.pixels, views.pixels[: len(alone.pixels)])
+    assert decisions[-1].text.startswith("No generated view was trained on")
+    monkeypatch.undo()
     single = job(tmp_path / "single", model, "skip={seen: true}", split="1")
     told_of_one = texts(run_stages(single, *UP_TO_FIELD)["reconstruct"])
     assert not any("captured views show" in d for d in told_of_one), "one view alone has no depth"

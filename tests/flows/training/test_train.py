@@ -309,13 +309,17 @@ def test_photographs_are_half_of_the_autoencoder_s_images() -> None:
 
 def test_jitter_scales_positions_and_keeps_directions() -> None:
     cameras = torch.rand(6, 8, 4, 4, dtype=torch.float64) + 0.1
-    out = jitter_scale(cameras, 1.5, torch.Generator().manual_seed(0))
+    hints = torch.rand(6, 5, 12, 2, 2) + 0.1
+    out, told = jitter_scale(cameras, 1.5, torch.Generator().manual_seed(0), hints)
     factor = out[:, :, :3, 3:] / cameras[:, :, :3, 3:]
     assert torch.equal(out[..., :3], cameras[..., :3])
     assert torch.equal(out[:, :, 3], cameras[:, :, 3])
     assert factor.min() >= 1 / 1.5 - 1e-6
     assert factor.max() <= 1.5 + 1e-6
     torch.testing.assert_close(factor, factor[:, :1, :1, :1].expand_as(factor))
+    assert told is not None
+    assert torch.equal(told[:, :, :10], hints[:, :, :10])
+    torch.testing.assert_close(hints[:, :, 10:] / told[:, :, 10:], factor[:, :1, :1, :1].float().expand(6, 5, 2, 2, 2))
 
 
 def test_scores_tell_right_cameras_from_wrong_ones() -> None:
