@@ -160,7 +160,7 @@ def test_moving_shows_splats_and_two_browsers_do_not_disturb_each_other(viewer: 
     tabs[0].drag((250, 300), (80, 20))
 
     def has_moved(session: Session) -> bool:
-        return not np.allclose(session.client.camera.position, places[session])
+        return float(np.linalg.norm(session.client.camera.position - places[session])) > 1e-3
 
     until(lambda: has_moved(one) or has_moved(two))
     moved, still = (one, two) if has_moved(one) else (two, one)
