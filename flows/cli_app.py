@@ -15,7 +15,9 @@ app = typer.Typer(
 )
 
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for stores, tables, pictures and the report.")]
-DownscaleOption = Annotated[float, typer.Option(help="Divide image width and height by this.")]
+DownscaleOption = Annotated[
+    float | None, typer.Option(help="Divide image width and height by this; without it, by what the preset can use.")
+]
 SeedOption = Annotated[int, typer.Option(help="All randomness follows from it.")]
 ReaderOption = Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")]
 ImagesOption = Annotated[str | None, typer.Option(help="Image folder inside the scene, where there are several.")]

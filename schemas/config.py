@@ -33,8 +33,8 @@ NonNegativeFloat = Annotated[FiniteFloat, Field(ge=0)]
 class IngestConfig(_Model):
     """Reading the photos."""
 
-    downscale: Annotated[FiniteFloat, Field(ge=1)] = 1
-    """Divide width and height by this."""
+    downscale: Annotated[FiniteFloat, Field(ge=1)] | None = None
+    """Divide width and height by this; None: as the preset and the device's memory suggest, small photos by 1."""
     max_pixels: PositiveInt = 100_000_000
     """Refuse larger source images, in pixels."""
     frames: Annotated[int, Field(ge=2)] = 60

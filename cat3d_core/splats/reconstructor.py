@@ -22,6 +22,8 @@ from cat3d_core.splats.gaussians import Gaussians
 from cat3d_core.splats.rasterize import render
 from cat3d_core.splats.trainer import SplatTrainer, splats_of_state
 
+GAUSSIAN_PIXELS = 10
+
 
 class Splats:
     """3D Gaussian splatting with MCMC densification, see `Reconstructor`."""
@@ -53,6 +55,11 @@ class Splats:
     def from_state(cls, settings: Mapping[str, Any], state: Mapping[str, Tensor], device: str) -> Self:
         """As `from_tensors`, from the `state` of a training under way."""
         return cls.from_tensors(settings, splats_of_state(state), device)
+
+    @property
+    def view_pixels(self) -> int:
+        """A Gaussian covers about GAUSSIAN_PIXELS of a view."""
+        return GAUSSIAN_PIXELS * _config(self.settings["splats"]).most
 
     @property
     def trainer(self) -> SplatTrainer:

@@ -21,6 +21,9 @@ from cat3d_core.zipnerf.render import render_image, render_uncertainty
 from cat3d_core.zipnerf.settings import chosen_config, config_document, config_from_document, fitted, rules
 from cat3d_core.zipnerf.trainer import Trainer
 
+#: Photos that show a scene once, about.
+PASSED = 8
+
 
 class ZipNerf:
     """Robust Zip-NeRF (CAT3D sec. 'Robust 3D reconstruction'), see `Reconstructor`."""
@@ -51,6 +54,12 @@ class ZipNerf:
         """As `from_tensors`, from the `state` of a training under way."""
         own = {name.removeprefix("field."): v for name, v in state.items() if name.startswith("field.")}
         return cls.from_tensors(settings, own, device)
+
+    @property
+    def view_pixels(self) -> int:
+        """So many that the training sees each pixel of PASSED views once: what is more stays blurred."""
+        config = config_from_document(self.settings["trainer"])
+        return config.iterations * config.batch_rays // PASSED
 
     @property
     def trainer(self) -> Trainer:

@@ -22,6 +22,7 @@ from cat3d_core.zipnerf import PRESETS
 from flows.bench import cameras, metrics, plan, poses, reconstruct, sampler, scenes, skips, splats, store, synthetic
 from flows.bench.peers import compare
 from flows.bench.rows import MissingError, Row, marked, scenes_of
+from flows.bench.size import size_rows
 from flows.generation.formats import cat3d
 from flows.media.images import read_image
 from flows.readers import read_capture
@@ -280,6 +281,14 @@ BENCHES: dict[str, Bench] = {
             Panel("Reconstruction beside nerfacto", "seconds", "psnr_db", ("who", "setting"), ("step",),
                   ("scene", "views"), where=(("part", "reconstruction"),), higher_is_better=True),
             Panel("Samplers", "steps", "error", ("who", "setting"), where=(("part", "sampler"),)),
+        ),
+    ),
+    "size": Bench(
+        "seconds and peak memory of a whole run by the number and size of the photos, as phones make them",
+        size_rows,
+        (
+            Panel("Seconds by the number of photos", "photos", "cpu_seconds", ("megapixels",)),
+            Panel("Memory by the number of photos", "photos", "peak_gb", ("megapixels",)),
         ),
     ),
     "synthetic": Bench("procedural scenes rendered: views a second per family", synthetic_rows),

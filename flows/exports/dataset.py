@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from flows.sfm.colmap import pycolmap
 
 
 def write_dataset(
-    folder: Path, cameras: Cameras, images: list[np.ndarray], captured_name: list[str | None],
+    folder: Path, cameras: Cameras, images: Iterable[np.ndarray], captured_name: list[str | None],
     points: np.ndarray, normals: np.ndarray, colours: np.ndarray,
 ) -> list[str]:  # fmt: skip
     """Write images/*.png, transforms.json, sparse_pc.ply and sparse/0/*.txt; the names of the images.

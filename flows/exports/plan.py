@@ -24,6 +24,8 @@ from flows.progress import meter
 from flows.reconstruction.stored import read_reconstruction
 from schemas.scene_store import Run, SceneStore
 
+#: Photos that are warped into a planned view, at most.
+NEAREST = 48
 _READ_ME = """The views of a plan, to be made by any program.
 
 transforms.json (nerfstudio, OpenGL camera axes) and sparse/0 (COLMAP, text) hold the cameras of the photos in given/
@@ -72,7 +74,7 @@ def open_plan(path: Path, run_name: str | None, frame: str) -> PlanSource:
 def write_plan_folder(source: PlanSource, folder: Path, store_path: Path) -> int:
     """Write cameras, photos and hints; the number of planned views."""
     train = views_with_role(source.store, source.run, "train")
-    cameras, photos = read_cameras(source.store.captured, train), read_images(source.store.captured, train)
+    cameras, photos = read_cameras(source.store.captured, train), list(read_images(source.store.captured, train))
     names = [f"given/captured_{i:04d}.png" for i in range(len(train))]
     for part in ("given", "views"):
         (folder / part).mkdir(parents=True, exist_ok=True)
@@ -90,7 +92,7 @@ def write_plan_folder(source: PlanSource, folder: Path, store_path: Path) -> int
         count=len(planned), first=view_name(0), last=view_name(len(planned) - 1), width=width, height=height,
         store=store_path, run=source.run.name,
     )  # fmt: skip
-    (folder / "README.txt").write_text(text)
+    (folder / "README.txt").write_text(text, encoding="utf-8")
     if source.scene is not None:
         _write_hints(source, source.scene, cameras, photos, folder / "hints")
     return len(planned)
@@ -99,18 +101,16 @@ def write_plan_folder(source: PlanSource, folder: Path, store_path: Path) -> int
 def _write_hints(
     source: PlanSource, scene: Reconstructor, cameras: Cameras, photos: list[torch.Tensor], folder: Path
 ) -> None:
-    """Depth of each planned view by the reconstruction, and the photos warped by it, the nearest first."""
+    """Depth of each planned view by the reconstruction, and the nearest photos warped by it, the nearest first."""
     folder.mkdir(exist_ok=True)
     depths = [scene.render(cameras, i).depth.cpu().float() for i in range(len(cameras))]
-    colours = [photo.permute(2, 0, 1).float() / 255 for photo in photos]
     targets = source.plan.cameras
     with meter(f"hints {source.store.scene_id} {source.run.name}", len(targets)) as progress:
         for view in range(len(targets)):
             depth = scene.render(targets, view).depth.cpu().float()
-            order = (cameras.centers - targets.centers[view]).norm(dim=-1).argsort().tolist()
-            image, seen = warp(
-                [colours[i] for i in order], [depths[i] for i in order], cameras[order], targets[view], depth
-            )
+            order = (cameras.centers - targets.centers[view]).norm(dim=-1).argsort()[:NEAREST].tolist()
+            colours = [photos[i].permute(2, 0, 1).float() / 255 for i in order]
+            image, seen = warp(colours, [depths[i] for i in order], cameras[order], targets[view], depth)
             name = Path(view_name(view))
             np.save(folder / f"{name.stem}_depth.npy", (depth * source.frame_from_scene.scale).numpy())
             rgba = torch.cat([image, seen[None].float()]).permute(1, 2, 0)

@@ -49,6 +49,22 @@ def available_memory() -> int | None:
     return None
 
 
+def total_memory() -> int | None:
+    """Bytes that this process's device has, or that its container may use; None where the system doesn't say."""
+    where = device()
+    if where == "cuda":
+        return int(torch.cuda.get_device_properties(0).total_memory)
+    if where == "mps":
+        return int(torch.mps.recommended_max_memory())
+    found = []
+    with contextlib.suppress(AttributeError, OSError, ValueError):
+        found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    for limit in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        with contextlib.suppress(OSError, ValueError), open(limit) as file:
+            found.append(int(file.read()))  # "max", where there is no limit, is no number
+    return min(found, default=None)
+
+
 def visible_gpus() -> list[str]:
     """The GPUs this process may use, as CUDA_VISIBLE_DEVICES names them."""
     given = os.environ.get("CUDA_VISIBLE_DEVICES")

@@ -25,6 +25,8 @@ from flows.media.lens import distorted_pixels, filling_zoom
 
 #: sRGB grey around images that are padded to squares: the middle of the range the autoencoder knows.
 PADDING = 128
+#: Pixels that are undistorted at a time.
+STRIP_PIXELS = 1 << 20
 
 
 def read_image(
@@ -130,13 +132,18 @@ def undistort(
     height, width = image.shape[:2]
     new = intrinsics.clone()
     new[0, 0], new[1, 1] = intrinsics[[0, 1], [0, 1]] * filling_zoom(intrinsics, distortion, width, height, fisheye)
-    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    source = distorted_pixels(torch.stack([columns, rows], -1).double(), new, intrinsics, distortion, fisheye)
-    # In grid_sample without align_corners -1 to 1 is the area of the image.
-    grid = (2 * source / torch.tensor([width, height]) - 1).float()
-    mode = "nearest" if nearest else "bicubic"
-    out = F.grid_sample(_planes(image), grid[None], mode=mode, padding_mode="border", align_corners=False)
-    return _from_planes(out, image.ndim), new
+    planes, out = _planes(image), np.empty_like(image)
+    rows = max(1, STRIP_PIXELS // width)
+    for first in range(0, height, rows):  # the positions of all pixels of a large photo would take gigabytes
+        last = min(first + rows, height)
+        y, x = torch.meshgrid(torch.arange(first, last) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+        source = distorted_pixels(torch.stack([x, y], -1).double(), new, intrinsics, distortion, fisheye)
+        # In grid_sample without align_corners -1 to 1 is the area of the image.
+        grid = (2 * source / torch.tensor([width, height]) - 1).float()
+        mode = "nearest" if nearest else "bicubic"
+        strip = F.grid_sample(planes, grid[None], mode=mode, padding_mode="border", align_corners=False)
+        out[first:last] = _from_planes(strip, image.ndim)
+    return out, new
 
 
 def write_png(path: Path | str, image: np.ndarray | Tensor) -> None:

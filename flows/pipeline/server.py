@@ -25,6 +25,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from flows.errors import ServerError
+from flows.pipeline.disk import naming_full_disk
 
 START_TIMEOUT_S = 120.0
 _PR_SET_PDEATHSIG = 1
@@ -57,9 +58,16 @@ def _without_proxy() -> str:
 def prefect_server(home: Path) -> Iterator[str]:
     """Yield the API address of a running server; must be entered before any flow is run.
 
-    home: folder for the server's database (created). Raises ServerError when no server answers in START_TIMEOUT_S.
-    SIGTERM is turned into SystemExit(143) while the server runs, so that `finally` blocks are reached.
+    home: folder for the server's database (created). Raises ServerError when no server answers in START_TIMEOUT_S, and
+    StoreError for whatever fails in it because the disk is full. SIGTERM is turned into SystemExit(143) while the
+    server runs, so that `finally` blocks are reached.
     """
+    with naming_full_disk(home), _server(home) as url:
+        yield url
+
+
+@contextlib.contextmanager
+def _server(home: Path) -> Iterator[str]:
     given = os.environ.get("PREFECT_API_URL")
     if given:
         _wait_until_healthy(given, None, 10.0)

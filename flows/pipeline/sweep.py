@@ -13,6 +13,7 @@ from flows.jobs.job import Job, SplitError
 from flows.jobs.request import Request
 from flows.jobs.scene import Scene
 from flows.pipeline.keys import pending
+from flows.pipeline.working_size import with_working_size
 from flows.progress import console
 from schemas.config import SceneSource, SweepConfig, parse_config
 from schemas.errors import ConfigError
@@ -74,7 +75,7 @@ def scene_jobs(config: SweepConfig, scene: SceneSource, source: str, out: Path, 
     except InputError as error:
         problems.append(f"{error} {scene.obtain}".strip())
         return []
-    return jobs
+    return with_working_size(jobs) if jobs else []
 
 
 def open_jobs(jobs: list[Job]) -> list[Job]:

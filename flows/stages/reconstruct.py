@@ -28,7 +28,9 @@ def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
     preset or rule makes old fields stale."""
     skip = job.config.skip
     seen = ENOUGH if skip.seen and job.generates else skip.seen
-    found = {"train": job.view_names("train"), "detail": skip.detail, "seen": seen}
+    found: dict[str, Any] = {"train": job.view_names("train"), "detail": skip.detail, "seen": seen}
+    if job.generates and skip.seen and job.capture().mask_training:
+        found["masks"] = True  # the brief field heeds them
     return found | dict(open_reconstructor(job).settings)
 
 

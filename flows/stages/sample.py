@@ -33,7 +33,10 @@ NEAR = 0.25
 
 def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
     """The generator, the sampler it is used with, and how the views are chosen."""
-    return {"model": generator_spec(job).identity, "sampler": sampler_settings(job), "rounds": job.config.skip.rounds}
+    rounds = job.config.skip.rounds
+    found = {"model": generator_spec(job).identity, "sampler": sampler_settings(job), "rounds": rounds}
+    # Brief fields heed masks since there are some to train by.
+    return found | ({"masks": True} if rounds and job.capture().mask_training else {})
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:

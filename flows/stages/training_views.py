@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from itertools import chain
 
 import torch
 from torch.nn import functional
@@ -27,7 +28,6 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
     """The run's training views: captured ones, and the generated ones where the run has them; what was decided."""
     train = views_with_role(store, run, "train")
     cameras = read_cameras(store.captured, train)
-    images = read_images(store.captured, train)
     decisions, made = [], []
     if not job.generates:
         decisions.append(chosen("No views were generated: method zipnerf trains on captured views alone."))
@@ -45,7 +45,6 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
                 pixels = sum(a.numel() - b.numel() for a, b in reduced) // 3
                 decisions.append(skipped(text, "detail", pixels=pixels))
         cameras = Cameras.cat([cameras, *(view.camera for view in made)])
-        images += [view.image for view in made]
         if not made:
             text = "Trained on captured views alone, without the LPIPS loss: no view was generated."
             decisions.append(skipped(text))
@@ -55,14 +54,15 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
         masks += [None] * (len(cameras) - len(train))
         decisions.append(skipped("Pixels outside the masks of captured views were not trained on."))
     maps = hint_maps(len(train), made)
+    images = chain(read_images(store.captured, train), (view.image for view in made))
     views = Views.from_images(cameras, images, captured, masks, **maps)
     kept, told = unseen(job, views)
     if told is None:
         return views, decisions
     if kept is not None:
         return views.only(kept), [*decisions, told]
-    known = slice(0, len(train))
-    alone = Views.from_images(cameras[known], images[known], captured[known], None if masks is None else masks[known])
+    known, photos = slice(0, len(train)), read_images(store.captured, train)
+    alone = Views.from_images(cameras[known], photos, captured[known], None if masks is None else masks[known])
     return alone, [*decisions, told]
 
 
