@@ -20,7 +20,7 @@ from schemas.decisions import Decision, chosen, skipped
 from schemas.scene_store import Run, SceneStore
 
 #: Share of the pixels of generated views that captured ones show as well from which on none is trained on. Measured on
-#: the procedural sweep: below 0.4 they gain 2 to 8 dB, from 0.5 on -0.5 to 0.1 (docs/log/2026-11-28_hints.md).
+#: the procedural sweep: below 0.4 they gain 1 to 8 dB, from 0.5 on -0.5 to 0.1 (docs/log/2026-11-28_hints.md).
 ENOUGH = 0.5
 
 
