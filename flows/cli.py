@@ -152,12 +152,13 @@ def import_views(
 def view(
     path: Annotated[Path, typer.Argument(help="A scene store (a .zarr folder), or the folder of a run or sweep.")],
     run_name: Annotated[str | None, typer.Option("--run", help="The run that is shown first.")] = None,
-    port: Annotated[int, typer.Option(help="Port to serve it at, on 127.0.0.1.")] = 8080,
+    port: Annotated[int, typer.Option(help="Port to serve it at.")] = 8080,
+    host: Annotated[str, typer.Option(help="Address to serve it on; all but loopback need a token.")] = "127.0.0.1",
 ) -> None:
     """Look at scenes in the browser: cameras, pictures, splats, the field itself; also while they are being made."""
     from flows.commands.view import view_command
 
-    view_command(path, run_name, port)
+    view_command(path, run_name, port, host)
 
 
 @app.command()
