@@ -181,6 +181,7 @@ def test_only_one_command_writes_a_store(tmp_path: Path) -> None:
         (["run", SCENE, "--reader", "magic"], 1, 'There is no reader "magic"'),
         (["run", SCENE, "--set", "reconstruct.overrides={speed: 3}"], 1, "speed is not a setting of the trainer"),
         (["inspect", "/nonexistent.zarr"], 1, "does not exist"),
+        (["sweep", "procedural", "--out", "s3://bucket/x"], 1, "s3://bucket/x is not on a file system"),
         (["run"], 2, "Give the scene's folder, or --prompt"),
         (["fly"], 2, "No such command"),
     ],
