@@ -25,6 +25,8 @@ test-slow: setup
 
 lint: setup
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
+	$(BIN)/bandit --quiet --configfile pyproject.toml --recursive cat3d_core schemas flows infra
+	$(BIN)/python -m infra.audit
 
 # Reference pages from the code, then the site; a warning fails. The variable hides a notice about MkDocs 2.
 docs: setup

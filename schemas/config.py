@@ -23,7 +23,7 @@ from pydantic import (
 
 from schemas.errors import ConfigError
 from schemas.hints import HintsConfig
-from schemas.settings import spelled_out
+from schemas.settings import shortened, spelled_out
 from schemas.skip import SkipConfig
 from schemas.strict import StrictModel as _Model
 
@@ -246,7 +246,7 @@ def load_config(path: str | Path, model: type[BaseModel] = RunConfig) -> Any:
     except OSError as error:
         raise ConfigError(f"{path} can't be read: {error.strerror}.") from None
     try:
-        document = json.loads(text) if path.suffix == ".json" else yaml.load(text, _UniqueKeys)
+        document = json.loads(text) if path.suffix == ".json" else yaml.load(text, _UniqueKeys)  # nosec B506
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         kind = "JSON" if path.suffix == ".json" else "YAML"
         raise ConfigError(f"{path} is not valid {kind}: {' '.join(str(error).split())}.") from None
@@ -277,7 +277,7 @@ def _sentence(source: str, error: dict[str, Any], model: type[BaseModel]) -> str
     if isinstance(cause := error.get("ctx", {}).get("error"), ConfigError):
         return f"{source}: {cause}"
     message = error["msg"][0].lower() + error["msg"][1:]
-    return f"{source}: {field} is {error['input']!r}, but {message}."
+    return f"{source}: {field} is {shortened(error['input'])}, but {message}."
 
 
 def _known(location: tuple[Any, ...], model: type[BaseModel]) -> str:

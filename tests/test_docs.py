@@ -125,12 +125,13 @@ def test_readme_is_short_and_shows_pictures() -> None:
 
 
 def test_readmes_table_of_quality(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Means over scenes, deviation over seeds, gain, and what the numbers are of; nothing of other splits."""
+    """Means over scenes, errors over seeds, gain, and what the numbers are of; nothing of other splits."""
     from infra.docs import quality
 
     def row(method: str, seed: int, psnr: float, split: str = "3") -> dict[str, object]:
         return {
             "dataset": "llff",
+            "scene_id": "a",
             "method": method,
             "split": split,
             "seed": seed,
@@ -143,9 +144,9 @@ def test_readmes_table_of_quality(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(quality, "summary_rows", lambda _: rows)
     monkeypatch.setattr(quality, "_last_day", lambda _: "2026-11-28")
     text = quality.table(tmp_path)
-    assert "| things before a wall, from the front | 21.0 ± 1.4 | 24.5 ± 0.7 | +3.5 | +4.3 |" in text
+    assert "| things before a wall, from the front | 21.0 ± 1.0 | 24.5 ± 0.5 | +3.5 ± 1.1 ≈ | +4.3 |" in text
     prose = " ".join(text.split("\n\n")[1].split())
-    assert "one scene a row; ± is the standard deviation over two seeds" in prose
+    assert "one scene a row; ± is the standard error over two seeds" in prose
     rows[:] = rows[:2]
     with pytest.raises(ValueError, match="no data set with 3 views of both zipnerf and cat3d"):
         quality.table(tmp_path)

@@ -197,12 +197,17 @@ def synthetic_rows(quick: bool, data: Path | None) -> list[Row]:
 
 
 def splat_rows(quick: bool, data: Path | None) -> list[Row]:
-    """The rasteriser's speed, splats of fields, and both reconstructors on few views."""
+    """The rasteriser's speed, splats of fields (with `data` of captured scenes too), both reconstructors on few
+    views."""
     if quick:
         families = ("co3d",)
-        rows = splats.kernel_rows(1, (1,)) + splats.conversion_rows(families, size=32, steps=60)
+        rows = splats.kernel_rows(1, (1,))
+        rows += splats.conversion_rows(splats.procedural_scenes(families, 32), steps=60)
         return rows + splats.method_rows(families, (3,), (0,), (("splats", "tiny"),), size=32)
-    return splats.kernel_rows() + splats.conversion_rows() + splats.method_rows()
+    rows = splats.kernel_rows() + splats.conversion_rows(splats.procedural_scenes())
+    if data is not None:
+        rows += splats.conversion_rows(splats.captured_scenes(scenes_of(data, list(scenes.DOWNSCALE))))
+    return rows + splats.method_rows()
 
 
 _SAMPLER_POINT = {"series": ("solver", "nodes"), "label": ("steps", "dtype"), "each": ("interval",)}

@@ -10,10 +10,11 @@ import numpy as np
 
 from cat3d_core.cameras import Cameras
 from flows.errors import InputError
-from flows.exports.ply import write_bytes, write_ply
+from flows.exports.ply import write_ply
 from flows.media.images import write_png
 from flows.readers.parsing import from_opengl
 from flows.sfm.colmap import pycolmap
+from schemas.documents import write_bytes
 
 
 def write_dataset(

@@ -16,6 +16,7 @@ from flows.pipeline.keys import pending
 from flows.pipeline.working_size import with_working_size
 from flows.progress import console
 from schemas.config import SceneSource, SweepConfig, parse_config
+from schemas.documents import write_bytes
 from schemas.errors import ConfigError
 from schemas.settings import merged
 
@@ -93,7 +94,7 @@ def run_sweep(config: SweepConfig, out: Path) -> list[str]:
     total, left = sum(map(len, scenes)), sum(map(len, todo))
     console.print(f"{config.name}: {len(scenes)} scenes, {total} runs, of which {left} are to do.")
     out.mkdir(parents=True, exist_ok=True)
-    (out / SWEEP).write_text(json.dumps(config.model_dump(mode="json"), indent=1))
+    write_bytes(out / SWEEP, json.dumps(config.model_dump(mode="json"), indent=1).encode())
     if todo:
         # Only here: importing Prefect would be half the time of a sweep in which nothing is to do.
         from flows.pipeline.server import prefect_server
@@ -101,7 +102,7 @@ def run_sweep(config: SweepConfig, out: Path) -> list[str]:
 
         with prefect_server(out / ".prefect"):
             problems += sweep_flow(todo, config.workers)
-    (out / PROBLEMS).write_text(json.dumps(problems, indent=1))
+    write_bytes(out / PROBLEMS, json.dumps(problems, indent=1).encode())
     page = write_report(out, only_if_changed=not todo)
     console.print(f"Report: {page}")
     return problems

@@ -14,6 +14,7 @@ from torch import Tensor
 from cat3d_core.cameras import Cameras, orthonormalize
 from flows.errors import InputError
 from flows.media.files import image_size, list_images, orientation
+from flows.media.packed import check_zip
 from flows.readers.matching import check_link
 
 # Image and calibration may differ in aspect by rounding (3118 x 2078 -> 800 x 533), not by a crop or a turn.
@@ -54,6 +55,10 @@ def load_json(path: Path) -> Any:
         ) from None
     except UnicodeDecodeError:
         raise InputError(f"{path} is not a text file in UTF-8; write it as JSON again.") from None
+    except RecursionError:
+        raise InputError(f"{path} is nested deeper than any description of a scene; correct the file.") from None
+    except ValueError as error:  # such as a number of more than 4,300 digits
+        raise InputError(f"{path} is not valid JSON: {error}; correct the file.") from None
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from None
 
@@ -61,6 +66,7 @@ def load_json(path: Path) -> Any:
 def load_arrays(path: Path, keys: list[str]) -> dict[str, np.ndarray]:
     """Arrays of an .npz file, never unpickled. InputError for a missing key or a damaged file."""
     try:
+        check_zip(path)
         with np.load(path, allow_pickle=False) as archive:
             lacking = [k for k in keys if k not in archive]
             if lacking:

@@ -21,8 +21,10 @@ from flows.jobs.metric_table import metric_table
 from flows.media.pictures import depth_picture, error_picture
 from flows.reporting.answer import answers, best_runs, rivals
 from flows.reporting.charts import Point, Series, chart
+from flows.reporting.seeds import NOISE, seeds_of
 from flows.reporting.summary import (
     markdown,
+    mean_text,
     method_order,
     method_times,
     missing_networks,
@@ -38,6 +40,7 @@ from flows.reporting.summary import (
 )
 from flows.reporting.turning import PAGE_BYTES, turning_scene
 from flows.stages import STAGES
+from schemas.documents import write_bytes
 from schemas.scene_store import Run, SceneStore
 from schemas.tables import TIMINGS, read_rows
 
@@ -59,7 +62,7 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
     tables = paper_tables(rows)
     sweep = _document(out / SWEEP) or {}
     environment = Environment(loader=PackageLoader("flows.reporting"), autoescape=select_autoescape(["html", "j2"]))
-    environment.filters |= {"fixed": number, "title": title}
+    environment.filters |= {"fixed": number, "mean": mean_text, "title": title}
     published = any(e["published"] for t in tables for d in t["datasets"] for e in d["rows"])
     context = {
         "title": sweep.get("name", out.name),
@@ -72,6 +75,8 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
         "psnr": {(r["scene_id"], r["run"]): r["psnr_db"] for r in rows},
         "tables": tables,
         "published": published,
+        "noise": NOISE,
+        "seeds": seeds_of(rows),
         "paper_metrics": paper_metrics(),
         "shown": shown_metrics(rows),
         "missing": missing_networks(rows),
@@ -86,8 +91,9 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
         "versions": versions(out, scenes),
         "sweep": sweep,
     }
-    page.write_text(environment.get_template("report.html.j2").render(context), encoding="utf-8")
-    (out / "report.md").write_text(markdown(rows, tables), encoding="utf-8")
+    text = environment.get_template("report.html.j2").render(context)
+    write_bytes(out / "report.md", markdown(rows, tables).encode())
+    write_bytes(page, text.encode())  # last, and at once: `only_if_changed` takes a page that is there for a whole one
     return page
 
 

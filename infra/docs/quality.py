@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import statistics
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+from cat3d_core.metrics.seeds import Mean
 from flows.reporting.published import PUBLISHED
-from flows.reporting.summary import summary_rows
+from flows.reporting.seeds import NOISE, change, mean_of, seeds_of
+from flows.reporting.summary import mean_text, summary_rows
 from infra.docs.reference import wrapped
 from schemas.documents import write_bytes
 from schemas.tables import TIMINGS, read_rows
@@ -36,32 +37,29 @@ def write_table(page: Path, sweep: Path) -> None:
 
 
 def table(sweep: Path) -> str:
-    """A row for each data set: PSNR (dB) of both methods with the deviation over seeds, the gain, the paper's gain."""
-    found: dict[tuple[str, str], dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    """A row for each data set: PSNR (dB) of both methods and the gain, with errors over seeds, and the paper's gain."""
+    found: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for row in summary_rows(sweep):
         if row["split"] == SPLIT and row["protocol"] == "google" and row["psnr_db"] is not None:
-            found[row["dataset"], row["method"]][row["seed"]].append(row["psnr_db"])
+            found[row["dataset"], row["method"]].append(row)
     datasets = [d for d in sorted({d for d, _ in found}) if found.get((d, BASELINE)) and found.get((d, GENERATED))]
     if not datasets:
         raise ValueError(f"{sweep} has no data set with {SPLIT} views of both {BASELINE} and {GENERATED}.")
     lines = ["| procedural scene | photos alone | with generated views | gain | the paper's |", "|---|---|---|---|---|"]
     for dataset in datasets:
-        alone, generated = (_by_seed(found[dataset, m]) for m in (BASELINE, GENERATED))
-        gain = statistics.mean(generated) - statistics.mean(alone)
+        alone, generated = (found[dataset, m] for m in (BASELINE, GENERATED))
+        means = [mean_text(mean_of(rows, "psnr_db"), 1) for rows in (alone, generated)]
+        gain = change(generated, alone, "psnr_db")
         name, published = FAMILIES.get(dataset, (dataset, dataset))
-        cells = [name, _cell(alone), _cell(generated), f"{gain:+.1f}", _paper(published)]
+        cells = [name, *means, _signed(gain) if gain else "", _paper(published)]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join([*lines, "", *_caption(sweep, found)])
 
 
-def _by_seed(values: dict[int, list[float]]) -> list[float]:
-    """For each seed the mean over its scenes."""
-    return [statistics.mean(of_seed) for _, of_seed in sorted(values.items())]
-
-
-def _cell(seeds: list[float]) -> str:
-    mean = f"{statistics.mean(seeds):.1f}"
-    return f"{mean} ± {statistics.stdev(seeds):.1f}" if len(seeds) > 1 else mean
+def _signed(gain: Mean) -> str:
+    """A gain with its sign, and a mark where it is noise."""
+    text = f"+{gain.text(1)}" if gain.value > 0 else gain.text(1)
+    return f"{text} {NOISE}" if gain.certain is False else text
 
 
 def _paper(dataset: str) -> str:
@@ -74,9 +72,9 @@ def _paper(dataset: str) -> str:
 
 def _caption(sweep: Path, found: dict[Any, Any]) -> list[str]:
     """What the numbers are of, in lines of at most 100 characters."""
-    seeds = max(len(values) for values in found.values())
-    scenes = max(len(of_seed) for values in found.values() for of_seed in values.values())
-    over = f"± is the standard deviation over {_words(seeds, 'seed')}" if seeds > 1 else "one seed, so without ±"
+    seeds = max(seeds_of(rows) for rows in found.values())
+    scenes = max(len({row["scene_id"] for row in rows}) for rows in found.values())
+    over = f"± is the standard error over {_words(seeds, 'seed')}" if seeds > 1 else "one seed, so without ±"
     text = (
         f"PSNR in dB of held-out views with three photos, {_words(scenes, 'scene')} a row; {over}. Sweep "
         f"`{_name(sweep)}` of {_last_day(sweep)}. The paper's gain is that of CAT3D over Zip-NeRF\\* in its Table 1 on "

@@ -50,12 +50,3 @@ def test_two_legs_and_the_way_home(tmp_path: Path) -> None:
     first = describe(tmp_path / "work" / "leg_0" / "model.safetensors")
     assert history["started_from"]["sha256"] == first["sha256"]
     assert "Exported 20" in (home / "model_card.md").read_text()
-
-
-@pytest.mark.slow
-def test_a_leg_of_the_model_with_hints(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    done = lease(tmp_path, "train", out, "70", PRESET="hints_gpu", SETTINGS=SMALL, RESERVE="30", SCENES="0")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert describe(tmp_path / "work" / "hints_leg_0" / "model.safetensors")["config"]["unet"]["hints"]
-    assert (out / "default.part.00").is_file()

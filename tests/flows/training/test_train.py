@@ -134,6 +134,7 @@ def test_killed_and_resumed_equals_uninterrupted_to_the_bit(trained: Path, confi
     assert read_rows(tmp_path / "training", TRAINING)["step"].to_pylist() == [2, 4, 6, 8]
 
 
+@pytest.mark.slow
 def test_two_ranks_under_torchrun_share_a_training(trained: Path, config: Path, tmp_path: Path) -> None:
     torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m")
     arguments = (config, "--out", tmp_path, "--set", "bank.scenes=26", "--set", "bank.views=8", "--steps", "2")

@@ -35,8 +35,8 @@ def random_model(path: Path, **unet: Any) -> Path:
 
 
 def make_job(out: Path, checkpoint: Path, split: str = "3", count: int = VIEWS, **execution: Any) -> Job:
-    """A cat3d run of `count` views in 24 steps: long enough to be interrupted."""
-    document = [f"sample.checkpoint={checkpoint}", "sample.steps=24", f"plan.views={count}", "seed=5", "method=cat3d"]
+    """A cat3d run of `count` views in 12 steps: long enough to be interrupted."""
+    document = [f"sample.checkpoint={checkpoint}", "sample.steps=12", f"plan.views={count}", "seed=5", "method=cat3d"]
     settings = [*document, *(f"execution.{name}={value}" for name, value in execution.items())]
     return Request(SOURCE, out, (split,), make_config({}, None, settings)).jobs()[0]
 
