@@ -9,6 +9,9 @@ from pathlib import Path
 from flows.errors import InputError
 from flows.progress import console
 
+#: Hosts that mean every address of this machine, which is for the user to ask for.
+EVERYWHERE = ("0.0.0.0", "::")  # nosec B104
+
 
 def view_command(path: Path, run: str | None, port: int, host: str = "127.0.0.1") -> None:
     """Serve a store or a folder of stores until Ctrl-C: on the loopback address, or on another one behind a token.
@@ -25,7 +28,7 @@ def view_command(path: Path, run: str | None, port: int, host: str = "127.0.0.1"
     viewer = Viewer(path, run, port, host)
     if viewer.port != port:
         console.print(f"The port {port} is taken; this is the next free one.")
-    name = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+    name = socket.gethostname() if host in EVERYWHERE else f"[{host}]" if ":" in host else host
     query = f"/?token={viewer.token}" if viewer.token else ""
     console.print(f"http://{name}:{viewer.port}{query}  shows {viewer.first}; Ctrl-C ends it.", soft_wrap=True)
     if viewer.token:

@@ -172,7 +172,8 @@ STAGE = Stage(
     execute,
     version=1,
     reads=("plan", "match", "encode"),
-    settings=settings_of("sample", "seed", without=("generator", "checkpoint")),  # its identity is among the inputs
+    # The generator's identity is among the inputs, and so is the start.
+    settings=settings_of("sample", "seed", without=("generator", "checkpoint", "start")),
     inputs=inputs,
     wanted=samples,
 )

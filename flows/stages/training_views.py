@@ -22,6 +22,13 @@ from schemas.scene_store import Run, SceneStore
 #: Share of the pixels of generated views that captured ones show as well from which on none is trained on. Measured on
 #: the procedural sweep: below 0.4 they gain 1 to 8 dB, from 0.5 on -0.5 to 0.1 (docs/log/2026-11-28_hints.md).
 ENOUGH = 0.5
+#: Up to so many captured views generated ones are always trained on: what two of so few show, they show badly.
+FEW = 3
+
+
+def enough(captured: int) -> float | None:
+    """ENOUGH where that rule holds for so many captured views, else None."""
+    return ENOUGH if captured > FEW else None
 
 
 def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[Decision]]:
@@ -104,7 +111,8 @@ def unseen(job: Job, views: Views) -> tuple[torch.Tensor | None, Decision | None
     pixels = int(views.size[~views.captured].prod(-1).sum())
     share = float(shown.sum()) / pixels
     says = f"too, by a brief reconstruction of those views ({time.monotonic() - started:.0f} s)."
-    if share >= ENOUGH:
+    bound = enough(captured)
+    if bound is not None and share >= bound:
         text = f"No generated view was trained on: {LEAST} captured views show the places of {share:.0%} of their "
         text += f"pixels {says} The rest would cost more than it gives."
         return None, skipped(text, "seen", pixels=pixels)

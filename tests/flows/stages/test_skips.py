@@ -288,6 +288,8 @@ def test_what_captured_views_show_is_not_learned_from_generated_ones(
     assert left_out(most) > 0.85
     assert fitted(trainer_config(one), most, {})[0].captured_share == left_out(most)
     monkeypatch.setattr("flows.stages.training_views.ENOUGH", share - 0.01)
+    assert len(training_views(one, store, store.run(one.run))[0]) > 3, "three photos are too few for that"
+    monkeypatch.setattr("flows.stages.training_views.FEW", 2)
     alone, decisions = training_views(one, store, store.run(one.run))
     assert len(alone) == 3, "captured views show most of what the generated ones do: these are left out"
     assert alone.valid is alone.weight is None, "and the captured ones are trained on as without them"

@@ -320,7 +320,9 @@ def test_jitter_scales_positions_and_keeps_directions() -> None:
     torch.testing.assert_close(factor, factor[:, :1, :1, :1].expand_as(factor))
     assert told is not None
     assert torch.equal(told[:, :, :10], hints[:, :, :10])
-    torch.testing.assert_close(hints[:, :, 10:] / told[:, :, 10:], factor[:, :1, :1, :1].float().expand(6, 5, 2, 2, 2))
+    torch.testing.assert_close(
+        hints[:, :, 10:] / told[:, :, 10:], factor[:, :1, :1, :1, None].float().expand(6, 5, 2, 2, 2)
+    )
 
 
 def test_scores_tell_right_cameras_from_wrong_ones() -> None:
