@@ -37,7 +37,8 @@ def full_disk(folder: Path, error: BaseException) -> str | None:
     if usage.free >= FULL_BYTES and not _no_space(error):
         return None
     disk = next(path for path in (there.resolve(), *there.resolve().parents) if os.path.ismount(path))
-    told = f" ({described})" if (described := describe(error)) and _no_space(error) else ""
+    ours = isinstance(error, OSError | StoreError)  # what Prefect's server says of it hides the cause
+    told = f" ({described})" if ours and (described := describe(error)) else ""
     return (
         f"The disk {disk}, on which {folder.parent} is, is full: {usage.free / 1e6:.1f} of {usage.total / 1e6:.0f} MB "
         f"are free{told}. Free space there, or choose an --out elsewhere, and run again: what is stored is kept."

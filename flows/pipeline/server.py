@@ -81,9 +81,10 @@ def _server(home: Path) -> Iterator[str]:
     for name in theirs:
         del os.environ[name]
     os.environ.update(environment)
-    template = _template_path()
-    if template is not None and not (home / "prefect.db").exists() and template.exists():
-        shutil.copyfile(template, home / "prefect.db")
+    template, database = _template_path(), home / "prefect.db"
+    fresh = not database.exists()
+    if fresh and template is not None and template.exists():
+        _copy(template, database)
     port = _free_port()
     url = f"http://127.0.0.1:{port}/api"
     log_path = home / "server.log"
@@ -98,9 +99,13 @@ def _server(home: Path) -> Iterator[str]:
         try:
             _wait_until_healthy(url, process, START_TIMEOUT_S)
         except ServerError as error:
+            if fresh:  # half made, it would end every later server too
+                _stop(process)
+                for part in home.glob(f"{database.name}*"):
+                    part.unlink()
             raise ServerError(f"{error} Its log is {log_path}.") from None
         if template is not None:
-            _save_template(home / "prefect.db", template)
+            _save_template(database, template)
         os.environ["PREFECT_API_URL"] = url
         with _settings_of_environment():
             yield url
@@ -186,6 +191,16 @@ def _template_path() -> Path | None:
     except RuntimeError:
         return None
     return cache / f"prefect-{importlib.metadata.version('prefect')}.db"
+
+
+def _copy(template: Path, database: Path) -> None:
+    """The whole template or, where the disk is full, nothing."""
+    part = database.with_suffix(".part")
+    try:
+        shutil.copyfile(template, part)
+        os.replace(part, database)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _save_template(database: Path, template: Path) -> None:

@@ -141,7 +141,13 @@ def scene_section(out: Path, path: Path) -> dict[str, Any]:
                 "curve": training_curve(run),
             }
         )
-    return {"id": store.scene_id, "dataset": store.dataset, "runs": runs, "provenance": store.attrs["provenance"]}
+    return {
+        "id": store.scene_id,
+        "title": store.captured.attrs.get("title", store.scene_id),
+        "dataset": store.dataset,
+        "runs": runs,
+        "provenance": store.attrs["provenance"],
+    }
 
 
 def embed_scenes(out: Path, scenes: Sequence[dict[str, Any]]) -> None:
