@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -144,7 +145,7 @@ def cameras_for_files(
     another aspect ratio, and what `Cameras.validate` finds.
     """
     for name, (w0, h0) in zip(names, calibrated_size.tolist(), strict=True):
-        if not (w0 > 0 and h0 > 0):
+        if not (0 < w0 < math.inf and 0 < h0 < math.inf):
             raise InputError(
                 f"{source}: view {name} has an image size of {w0:g} x {h0:g} pixels; both must be positive."
             )
@@ -206,7 +207,7 @@ def _turned(calibrated: Tensor, paths: list[Path], names: list[str], source: Pat
 
 
 def _same_aspect(w: float, h: float, w0: float, h0: float) -> bool:
-    return abs((w / h) / (w0 / h0) - 1) <= ASPECT_TOLERANCE
+    return abs(w * h0 - h * w0) <= ASPECT_TOLERANCE * h * w0
 
 
 def implied_size(

@@ -4,6 +4,7 @@ texts that become extreme ones. And what damaged input may do: end in a sentence
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import random
 import re
@@ -22,6 +23,7 @@ EXTREMES = [b"0", b"-1", b"1e999", b"NaN", b"null", b"[]", b"{}", b'""', b"true"
 PATTERNS = [b"\0\0\0\0", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\x01\0\0\0", b"\0\0\x80\x7f"]
 WORD = re.compile(rb"-?\d[\d.eE+-]*|\"[^\"\n]*\"|[A-Za-z_]+")
 #: A single damaged input may take so long, and the memory of the process may grow by so much while it is read.
+MOST = 2000
 SECONDS, BYTES = 30.0, 3 * 2**30
 
 
@@ -82,10 +84,12 @@ def seconds(quick: float) -> float:
 
 
 def numbers(limit_s: float) -> Iterator[int]:
-    """0, 1, ... until the time is over, and at least twenty of them; from CAT3D_FUZZ_FIRST on."""
+    """0, 1, ... until the time is over, at least twenty of them and at most MOST unless CAT3D_FUZZ_SECONDS asks for
+    more: the same inputs on every machine that is quick enough. From CAT3D_FUZZ_FIRST on."""
     first = int(os.environ.get("CAT3D_FUZZ_FIRST", 0))
+    most = math.inf if "CAT3D_FUZZ_SECONDS" in os.environ else first + MOST
     started, number = time.monotonic(), first
-    while number < first + 20 or time.monotonic() - started < limit_s:
+    while number < first + 20 or (number < most and time.monotonic() - started < limit_s):
         yield number
         number += 1
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import math
 import resource
 import signal
 from collections.abc import Iterator
@@ -12,20 +13,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from flows.errors import InputError
 from flows.jobs.job import Job
 from flows.media.images import write_jpeg, write_png
 from flows.media.video import write_video
 from flows.pipeline.runner import opened, prepare_run
+from flows.readers import read_capture
 from flows.readers.co3d import _annotated_frames
 from flows.readers.llff import _table
+from flows.readers.parsing import _same_aspect, cameras_for_files
 from schemas import documents
 from schemas.config import load_config
 from schemas.documents import write_metadata
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
 from schemas.verify import verify
+from tests.flows.readers.conftest import _cameras
+from tests.flows.readers.layouts import LAYOUTS
 from tests.reliability.tiny import model, tiny_job
 
 
@@ -151,3 +157,17 @@ def test_packages_that_nobody_knows_are_not_said_to_be_without_vulnerabilities()
     assert code == 1
     assert lines[0] == "b 2: CVE-1, mended in 3"
     assert lines[1:] == ["2 of 3 pinned packages were looked up.", "Nothing is known of c."]
+
+
+def test_sizes_of_almost_nothing_and_without_end(tmp_path: Path) -> None:
+    """A size that underflows when it is divided by, one that is infinite, and a time that is."""
+    assert not _same_aspect(64, 48, 1e-320, 48)
+    size = torch.tensor([[math.inf, 48.0]])
+    with pytest.raises(InputError, match="both must be positive"):
+        cameras_for_files(torch.eye(3)[None], size, torch.eye(4)[None], [tmp_path], ["a"], tmp_path, [])
+    path = LAYOUTS["realestate10k"](tmp_path / "scene", _cameras(2), [np.zeros((48, 64, 3), np.uint8)] * 2, ["1.png", "2.png"])
+    (listed,) = (tmp_path / "scene").rglob("*.txt")
+    lines = listed.read_text().splitlines()
+    listed.write_text("\n".join([*lines[:-1], "1e999 " + lines[-1].partition(" ")[2]]))
+    with pytest.raises(InputError, match="no finite number"):
+        read_capture(path)

@@ -146,7 +146,7 @@ def _say_otherwise(file: Path, rng: random.Random) -> None:
     for _ in range(20):
         try:
             document = json.loads(damaged(text, rng), parse_constant=lambda _: 0)
-        except ValueError:
+        except (ValueError, RecursionError):
             continue
         if isinstance(document, dict) and isinstance(document.get("attributes"), dict):
             write_metadata(file.parent, document)
