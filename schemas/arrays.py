@@ -103,8 +103,10 @@ def open_array(folder: Path, writable: bool) -> zarr.Array:
         array = zarr.open_array(str(folder), mode="r+" if writable else "r", zarr_format=3)
     except FileNotFoundError:  # removed by a writer since its metadata was read
         raise MissingError(f"{folder} does not exist.") from None
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, LookupError, TypeError, ArithmeticError, AttributeError) as error:
         raise StoreError(f"{folder / 'zarr.json'} is damaged: {error}") from error
+    if 0 in array.chunks:
+        raise StoreError(f"{folder / 'zarr.json'} is damaged: it names chunks of {array.chunks} values.")
     if math.prod(array.chunks) * array.dtype.itemsize > MAX_CHUNK_BYTES or math.prod(array.cdata_shape) > MAX_CHUNKS:
         raise StoreError(f"{folder} has {array.shape} values in chunks of {array.chunks}, it says: none of ours has.")
     return array.with_config({"write_empty_chunks": True})  # not stored with the array, so set at every opening
