@@ -165,7 +165,8 @@ def test_sizes_of_almost_nothing_and_without_end(tmp_path: Path) -> None:
     size = torch.tensor([[math.inf, 48.0]])
     with pytest.raises(InputError, match="both must be positive"):
         cameras_for_files(torch.eye(3)[None], size, torch.eye(4)[None], [tmp_path], ["a"], tmp_path, [])
-    path = LAYOUTS["realestate10k"](tmp_path / "scene", _cameras(2), [np.zeros((48, 64, 3), np.uint8)] * 2, ["1.png", "2.png"])
+    pixels = [np.zeros((48, 64, 3), np.uint8)] * 2
+    path = LAYOUTS["realestate10k"](tmp_path / "scene", _cameras(2), pixels, ["1.png", "2.png"])
     (listed,) = (tmp_path / "scene").rglob("*.txt")
     lines = listed.read_text().splitlines()
     listed.write_text("\n".join([*lines[:-1], "1e999 " + lines[-1].partition(" ")[2]]))
