@@ -76,9 +76,9 @@ def _caption(sweep: Path, found: dict[Any, Any]) -> list[str]:
     scenes = max(len({row["scene_id"] for row in rows}) for rows in found.values())
     over = f"± is the standard error over {_words(seeds, 'seed')}" if seeds > 1 else "one seed, so without ±"
     text = (
-        f"PSNR in dB of held-out views with three photos, {_words(scenes, 'scene')} a row; {over}. Sweep "
-        f"`{_name(sweep)}` of {_last_day(sweep)}. The paper's gain is that of CAT3D over Zip-NeRF\\* in its Table 1 on "
-        "the data set that the scene resembles: captured scenes, larger images, a larger model."
+        f"PSNR in dB of held-out views, three photos, {_words(scenes, 'scene')} a row; {over} (sweep `{_name(sweep)}`, "
+        f"{_last_day(sweep)}). The paper's: CAT3D over Zip-NeRF\\* in its Table 1, on captured scenes of that kind "
+        "with larger images and a larger model."
     )
     return wrapped(text)
 
