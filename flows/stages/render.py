@@ -79,7 +79,7 @@ def render_views(
     section.write("view", np.array(views, np.int32))
     parts = zip(views, cameras.intrinsics, cameras.world_from_camera, cameras.size, strict=True)
     keys = [content_key(step=key, view=view, camera=[array_digest(part.numpy()) for part in c]) for view, *c in parts]
-    done = section.done("done", keys, data=["image", "depth"])
+    done = section.done("done", keys, data=["image", "depth", "opacity"])
     rays = []
     for i in range(len(cameras)):
         if done[i]:
