@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.splats.gaussians import rotation_matrices
+from cat3d_core.quaternions import rotation_matrices
 
 NEAR = 0.01
 """Gaussians whose means are nearer (z-depth, scene units) are not drawn: the linearised projection ends there."""

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from cat3d_core.splats.gaussians import Gaussians, rotation_matrices
+from cat3d_core.quaternions import rotation_matrices
+from cat3d_core.splats.gaussians import Gaussians
 from cat3d_core.splats.rasterize import rasterize
 from flows.errors import InputError
 from flows.exports.splat_files import (
