@@ -48,12 +48,10 @@ def run_command(request: Request) -> list[Job]:
             from flows.pipeline.scene import scene_flow
 
             scene_flow(capture.scene_id, jobs)
-    from flows.pipeline.disk import naming_full_disk
     from flows.reporting.report import write_report
     from flows.reporting.summary import print_metrics
 
-    with naming_full_disk(out / "report.html"):
-        report = write_report(out, only_if_changed=not any(todo.values()))
+    report = write_report(out, only_if_changed=not any(todo.values()))
     print_metrics(out, capture.scene_id)
     console.print(f"Report: {report}  ({time.monotonic() - started:.0f} s)", markup=False)
     return jobs

@@ -24,8 +24,8 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
+from flows.disk import naming_full_disk
 from flows.errors import ServerError
-from flows.pipeline.disk import naming_full_disk
 
 START_TIMEOUT_S = 120.0
 _PR_SET_PDEATHSIG = 1

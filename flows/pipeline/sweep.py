@@ -12,7 +12,6 @@ from flows.errors import InputError
 from flows.jobs.job import Job, SplitError
 from flows.jobs.request import Request
 from flows.jobs.scene import Scene
-from flows.pipeline.disk import naming_full_disk
 from flows.pipeline.keys import pending
 from flows.pipeline.working_size import with_working_size
 from flows.progress import console
@@ -104,7 +103,6 @@ def run_sweep(config: SweepConfig, out: Path) -> list[str]:
         with prefect_server(out / ".prefect"):
             problems += sweep_flow(todo, config.workers)
     write_bytes(out / PROBLEMS, json.dumps(problems, indent=1).encode())
-    with naming_full_disk(out / "report.html"):
-        page = write_report(out, only_if_changed=not todo)
+    page = write_report(out, only_if_changed=not todo)
     console.print(f"Report: {page}")
     return problems

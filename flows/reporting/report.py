@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, select_autoescape
 
+from flows.disk import naming_full_disk
 from flows.jobs.metric_table import metric_table
 from flows.media.pictures import depth_picture, error_picture
 from flows.reporting.answer import answers, best_runs, rivals
@@ -52,10 +53,16 @@ SWEEP, PROBLEMS = "sweep.json", "problems.json"
 
 
 def write_report(out: Path, only_if_changed: bool = False) -> Path:
-    """Write report.html and report.md of the folder; returns the page. `only_if_changed` keeps a page that exists."""
+    """Write report.html and report.md of the folder; returns the page. `only_if_changed` keeps a page that exists.
+    Raises StoreError naming the disk where that is full."""
     page = out / "report.html"
-    if only_if_changed and page.exists():
-        return page
+    if not (only_if_changed and page.exists()):
+        with naming_full_disk(page):
+            _write(out, page)
+    return page
+
+
+def _write(out: Path, page: Path) -> None:
     scenes = [scene_section(out, path) for path in sorted(out.glob("*.zarr"))]
     embed_scenes(out, scenes)
     rows, timings = summary_rows(out), timing_rows(out)
@@ -94,7 +101,6 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
     text = environment.get_template("report.html.j2").render(context)
     write_bytes(out / "report.md", markdown(rows, tables).encode())
     write_bytes(page, text.encode())  # last, and at once: `only_if_changed` takes a page that is there for a whole one
-    return page
 
 
 def gallery(scenes: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flows import disk
 from flows.errors import describe
 from flows.media.images import write_png
-from flows.pipeline import disk
 from flows.pipeline.server import quiet_environment
 from schemas.errors import StoreError
 from schemas.scene_store import SceneStore
