@@ -34,9 +34,9 @@ class Mean:
             return None
         return abs(self.value) > t95(self.freedom) * self.error
 
-    def text(self, digits: int) -> str:
-        """Such as "21.34 ± 0.12", or the value alone where its error is not known."""
-        plain = f"{self.value:.{digits}f}"
+    def text(self, digits: int, signed: bool = False) -> str:
+        """Such as "21.34 ± 0.12", or the value alone where its error is not known. signed: a plus before a gain."""
+        plain = "+" * (signed and self.value > 0) + f"{self.value:.{digits}f}"
         return plain if self.error is None else f"{plain} ± {self.error:.{digits}f}"
 
 

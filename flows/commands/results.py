@@ -73,8 +73,7 @@ def compare(out: Path, against: Path) -> int:
                     untold += verdict == UNTOLD
                 digits = metric.digits if metric.unit == "dB" else metric.digits + 1  # changes are smaller than numbers
                 values = [mean_text(mean_of(rows, metric.name), digits) for rows in (old_rows, new_rows)]
-                sign = "+" if found.value > 0 else ""
-                table.add_row(scene, *key, metric.name, *values, sign + found.text(digits), _coloured(verdict))
+                table.add_row(scene, *key, metric.name, *values, found.text(digits, signed=True), _coloured(verdict))
     console.print(table)
     if not compared:
         raise InputError(f"{out} and {against} have no scene, method, split and protocol in common.")

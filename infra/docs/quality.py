@@ -58,7 +58,7 @@ def table(sweep: Path) -> str:
 
 def _signed(gain: Mean) -> str:
     """A gain with its sign, and a mark where it is noise."""
-    text = f"+{gain.text(1)}" if gain.value > 0 else gain.text(1)
+    text = gain.text(1, signed=True)
     return f"{text} {NOISE}" if gain.certain is False else text
 
 
