@@ -14,6 +14,7 @@ from cat3d_core.metrics.perceptual import perceptual_name
 from cat3d_core.reconstruction.perceptual import perceptual_loss
 from cat3d_core.reconstruction.protocol import ReconstructionRequest, Reconstructor
 from cat3d_core.reconstruction.render import Render
+from cat3d_core.reconstruction.trained import Trained
 from cat3d_core.reconstruction.views import Views
 from cat3d_core.zipnerf.config import PRESETS
 from cat3d_core.zipnerf.field import Field
@@ -25,7 +26,7 @@ from cat3d_core.zipnerf.trainer import Trainer
 PASSED = 8
 
 
-class ZipNerf:
+class ZipNerf(Trained[Trainer]):
     """Robust Zip-NeRF (CAT3D sec. 'Robust 3D reconstruction'), see `Reconstructor`."""
 
     presets: ClassVar[tuple[str, ...]] = tuple(PRESETS)
@@ -35,7 +36,6 @@ class ZipNerf:
     ) -> None:
         """Use `from_request` or `from_tensors`."""
         self.settings, self._request, self._field = settings, request, field
-        self._trainer: Trainer | None = None
 
     @classmethod
     def from_request(cls, request: ReconstructionRequest) -> Self:
@@ -62,13 +62,6 @@ class ZipNerf:
         return config.iterations * config.batch_rays // PASSED
 
     @property
-    def trainer(self) -> Trainer:
-        """The training under way. Raises ValueError before `start`."""
-        if self._trainer is None:
-            raise ValueError("This reconstruction has not been started.")
-        return self._trainer
-
-    @property
     def field(self) -> Field:
         """The field as it is now."""
         return self._field if self._field is not None else self.trainer.field
@@ -82,26 +75,8 @@ class ZipNerf:
         self._trainer = Trainer(config, views, seed, device, perceptual)
         return decisions + warnings
 
-    @property
-    def iteration(self) -> int:
-        return self.trainer.iteration
-
-    @property
-    def iterations(self) -> int:
-        return self.trainer.config.iterations
-
-    @property
-    def finished(self) -> bool:
-        return self.trainer.finished
-
     def step(self) -> dict[str, float]:
-        return self.trainer.step() | {"rays": float(self.trainer.config.batch_rays)}
-
-    def state(self) -> dict[str, Tensor]:
-        return self.trainer.state()
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        self.trainer.load_state(state)
+        return super().step() | {"rays": float(self.trainer.config.batch_rays)}
 
     def decisions(self) -> list[Decision]:
         return _skipped(self.trainer)
