@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import io
+import itertools
 import json
 import re
 from collections import defaultdict
@@ -47,6 +48,8 @@ from schemas.tables import TIMINGS, read_rows
 
 #: Held-out views shown of each run: all of a few, else this many.
 VIEWS_SHOWN = 3
+#: Of the stages in the time chart, in their order.
+COLOURS = ("#8da0cb", "#e78ac3", "#a6d854", "#b15fd6", "#6f7fb5", "#fc8d62", "#ffd92f", "#66c2a5", "#b3b3b3", "#e5c494")
 #: Scenes whose pictures stand at the top of the page, at most.
 SCENES_ON_TOP = 12
 SWEEP, PROBLEMS = "sweep.json", "problems.json"
@@ -90,6 +93,7 @@ def _write(out: Path, page: Path) -> None:
         "timings": timings,
         "longest": max((t["total"] for t in timings), default=0.0),
         "methods": method_times(timings),
+        "colours": dict(zip((s.name for s in STAGES), itertools.cycle(COLOURS))),
         "stages": [s.name for s in STAGES if any(s.name in t["stages"] for t in timings)],
         "shared": shared_savings(timings),
         "skipped": skipped_work(scenes),
