@@ -1,7 +1,7 @@
 """The layout of a scene store: every array it may hold, what it means, how it is stored and which stage writes it.
 
     scene.zarr/  captured/  latents/  stages/<stage>/
-                 runs/<run>/  plan/  generated/  field/  renders/<kind>/  stages/<stage>/
+                 runs/<run>/  plan/  hints/  generated/  field/  renders/<kind>/  stages/<stage>/
 
 Every array carries the names of its dimensions, its unit and its meaning, so that xarray opens each section as a
 dataset and the whole store as a tree.
