@@ -94,8 +94,8 @@ def inflate(unet: MultiViewUNet, weights: dict[str, Tensor], text_token: Tensor 
 
 
 def export_2d(unet: MultiViewUNet, latent_channels: int | None = None) -> dict[str, Tensor]:
-    """The 2D network inside: diffusers keys, raymap and mask channels cut off, text attention that adds nothing left
-    out. `inflate` of the result gives the same network as long as rays and mask had no effect yet."""
+    """The 2D network inside: diffusers keys; raymap, mask and hint channels cut off; text attention that adds nothing
+    left out. `inflate` of the result gives the same network as long as rays and mask had no effect yet."""
     keep = latent_channels or unet.config.latent_channels
     state = {k: v.detach().clone() for k, v in unet.state_dict().items() if "_views." not in k}
     state["conv_in.weight"] = state["conv_in.weight"][:, :keep]

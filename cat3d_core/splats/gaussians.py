@@ -71,6 +71,10 @@ class Gaussians:
         rows = [part.tensors() for part in parts]
         return Gaussians(**{name: torch.cat([row[name] for row in rows]) for name in rows[0]})
 
+    def detach(self) -> Gaussians:
+        """The same without gradient."""
+        return Gaussians(**{name: value.detach() for name, value in self.tensors().items()})
+
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
         """Moved, or in another dtype."""
         return Gaussians(**{name: value.to(device=device, dtype=dtype) for name, value in self.tensors().items()})

@@ -64,8 +64,7 @@ class Splats(Trained[SplatTrainer]):
     @property
     def gaussians(self) -> Gaussians:
         """The Gaussians as they are now, without gradient."""
-        found = self._gaussians if self._gaussians is not None else self.trainer.gaussians
-        return Gaussians(**{name: value.detach() for name, value in found.tensors().items()})
+        return (self._gaussians if self._gaussians is not None else self.trainer.gaussians).detach()
 
     def start(self, views: Views, seed: int, device: torch.device | str) -> list[Decision]:
         if self._request is None:

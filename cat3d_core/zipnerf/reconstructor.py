@@ -22,7 +22,7 @@ from cat3d_core.zipnerf.render import render_image, render_uncertainty
 from cat3d_core.zipnerf.settings import chosen_config, config_document, config_from_document, fitted, rules
 from cat3d_core.zipnerf.trainer import Trainer
 
-#: Photos that show a scene once, about.
+#: About so many photos show the whole scene once.
 PASSED = 8
 
 
