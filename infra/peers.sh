@@ -2,7 +2,7 @@
 # Makes the environment of the programs that `cat3d bench peers` compares with. Called by `make peers`.
 set -eu
 PYTHON=${PYTHON:-python3}
-PEERS=${PEERS:-.venv-peers}
+PEERS=${CAT3D_PEERS:-.venv-peers}
 
 [ -x "$PEERS/bin/python" ] || "$PYTHON" -m venv "$PEERS"
 "$PEERS/bin/python" -m pip install -q --no-deps -r infra/peers.txt

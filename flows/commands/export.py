@@ -63,7 +63,7 @@ def export_command(
     settings: SurfaceSettings | None = None,
     path_file: Path | None = None,
 ) -> list[Path]:
-    """Write what is asked for (comma-separated KINDS; mesh, points and dataset if empty) to `out`; what was made.
+    """Write to `out` what is asked for (comma-separated KINDS; mesh, points, splats and dataset if empty); the files.
 
     Raises InputError for everything a user can correct.
     """

@@ -32,7 +32,7 @@ def results_command(out: Path, against: Path | None) -> int:
     console.print(table)
     if seeds_of(rows) > 1:
         console.print(_means(rows, shown))
-    return compare(out, against) if against else 0
+    return compare(out, against, rows) if against else 0
 
 
 def _means(rows: Sequence[dict[str, Any]], shown: Sequence[Metric]) -> Table:
@@ -46,14 +46,14 @@ def _means(rows: Sequence[dict[str, Any]], shown: Sequence[Metric]) -> Table:
     return table
 
 
-def compare(out: Path, against: Path) -> int:
+def compare(out: Path, against: Path, rows: list[dict[str, Any]] | None = None) -> int:
     """Print the change of every mean over seeds that both folders have; the number of those over all scenes of a method
-    that are worse by more than seeds explain (95 %).
+    that are worse by more than seeds explain (95 %). rows: the summary of `out`, where it is read already.
 
     With one seed a change cannot be told from noise, which is said and is no regression. A single scene's change is
     marked too, but not counted: of twenty scenes one is beyond 95 % by chance.
     """
-    now, before = summary_rows(out), summary_rows(against)
+    now, before = rows or summary_rows(out), summary_rows(against)
     if not before:
         raise InputError(f"{against} holds no metrics to compare with.")
     table = Table("scene", "views", "method", "protocol", "metric", "before", "now", "change", "",

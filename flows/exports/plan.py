@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,13 +43,21 @@ by it (transparent where none shows the place).
 
 @dataclass(frozen=True)
 class PlanSource:
-    """A run with a plan; `scene`: what another or the same run reconstructed from these photos, None where none has."""
+    """A run with a plan."""
 
     store: SceneStore
     run: Run
     plan: Plan
-    scene: Reconstructor | None
     frame_from_scene: Similarity
+
+    @functools.cached_property
+    def scene(self) -> Reconstructor | None:
+        """What another or the same run reconstructed from these photos, None where none has."""
+        same = [name for name in self.store.runs() if self.store.record("reconstruct", name) is not None
+                and np.array_equal(self.store.run(name).read("role"), self.run.read("role"))]  # fmt: skip
+        planned = {name for name in same if self.store.record("plan", name) is not None}
+        same.sort(key=lambda name: (name in planned, name))  # rather of the photos alone
+        return read_reconstruction(self.store, self.store.run(same[0])) if same else None
 
 
 def open_plan(path: Path, run_name: str | None, frame: str) -> PlanSource:
@@ -64,11 +73,7 @@ def open_plan(path: Path, run_name: str | None, frame: str) -> PlanSource:
     if run.name not in planned:
         raise InputError(f"The run {run.name} of {path} has no plan; make it with `cat3d plan`.")
     plan = read_plan(run.plan, store.captured.shape("size")[0])
-    same = [name for name in store.runs() if store.record("reconstruct", name) is not None
-            and np.array_equal(store.run(name).read("role"), run.read("role"))]  # fmt: skip
-    same.sort(key=lambda name: (name in planned, name))  # rather of the photos alone
-    scene = read_reconstruction(store, store.run(same[0])) if same else None
-    return PlanSource(store, run, plan, scene, read_similarity(store).inverse() if frame == "world" else IDENTITY)
+    return PlanSource(store, run, plan, read_similarity(store).inverse() if frame == "world" else IDENTITY)
 
 
 def write_plan_folder(source: PlanSource, folder: Path, store_path: Path) -> int:

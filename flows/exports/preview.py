@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.reconstruction import Reconstructor
 from cat3d_core.splats import Gaussians, Splats
 from cat3d_core.splats.viewpoints import between
+from cat3d_core.weights_file import read_weights
 from flows.exports.splats import splats_of
 from flows.progress import meter
+from schemas.documents import write_bytes
 from schemas.scene_store import Run, SceneStore
 
 MOST = 100_000
@@ -50,11 +50,9 @@ def kept_preview(store: SceneStore, run: Run) -> Gaussians | None:
     if key is None or not path.exists():
         return None
     try:
-        with safe_open(path, "pt") as file:
-            if (file.metadata() or {}).get("key") != key:
-                return None
-            return Gaussians.from_tensors({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError):
+        metadata, tensors = read_weights(path)
+        return Gaussians.from_tensors(tensors) if metadata.get("key") == key else None
+    except (OSError, ValueError):
         return None  # a damaged one is made again
 
 
@@ -83,10 +81,8 @@ def make_preview(
     if key is not None:
         path = preview_path(store, run)
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(f".{os.getpid()}.part")
         tensors = {name: value.contiguous() for name, value in splats.tensors().items()}
-        save_file(tensors, part, metadata={"key": key})
-        os.replace(part, path)
+        write_bytes(path, save(tensors, {"key": key}))
     return splats
 
 

@@ -44,7 +44,7 @@ def splats_of(
             before_each()
             numbers = trainer.step()
             progress.advance(note=f"{numbers['psnr']:.1f} dB")
-    return Gaussians(**{name: value.detach() for name, value in trainer.gaussians.tensors().items()})
+    return trainer.gaussians.detach()
 
 
 def write_splats(folder: Path, gaussians: Gaussians, frame_from_scene: Similarity) -> tuple[list[Path], list[str]]:

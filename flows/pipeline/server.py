@@ -12,7 +12,6 @@ import contextlib
 import ctypes
 import multiprocessing
 import os
-import shutil
 import signal
 import socket
 import sqlite3
@@ -26,6 +25,7 @@ from pathlib import Path
 
 from flows.disk import naming_full_disk
 from flows.errors import ServerError
+from schemas.documents import write_bytes
 
 START_TIMEOUT_S = 120.0
 _PR_SET_PDEATHSIG = 1
@@ -84,7 +84,7 @@ def _server(home: Path) -> Iterator[str]:
     template, database = _template_path(), home / "prefect.db"
     fresh = not database.exists()
     if fresh and template is not None and template.exists():
-        _copy(template, database)
+        write_bytes(database, template.read_bytes())  # whole or, where the disk is full, not at all
     port = _free_port()
     url = f"http://127.0.0.1:{port}/api"
     log_path = home / "server.log"
@@ -191,16 +191,6 @@ def _template_path() -> Path | None:
     except RuntimeError:
         return None
     return cache / f"prefect-{importlib.metadata.version('prefect')}.db"
-
-
-def _copy(template: Path, database: Path) -> None:
-    """The whole template or, where the disk is full, nothing."""
-    part = database.with_suffix(".part")
-    try:
-        shutil.copyfile(template, part)
-        os.replace(part, database)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _save_template(database: Path, template: Path) -> None:

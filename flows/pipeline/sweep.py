@@ -61,7 +61,7 @@ def scene_folders(scene: SceneSource) -> list[str]:
 def scene_jobs(config: SweepConfig, scene: SceneSource, source: str, out: Path, problems: list[str]) -> list[Job]:
     """The jobs of one scene; what can't be had is added to `problems`."""
     jobs: list[Job] = []
-    place = Scene(source, scene.reader, scene.image_folder)
+    places: dict[Scene, Scene] = {}  # read once, however many jobs ask
     try:
         for label, settings in config.methods.items():
             for seed in config.seeds:
@@ -70,7 +70,7 @@ def scene_jobs(config: SweepConfig, scene: SceneSource, source: str, out: Path, 
                 for split in config.splits:
                     request = Request(source, out, (split,), run, scene.reader, scene.image_folder)
                     try:
-                        jobs += request.jobs(place)
+                        jobs += request.jobs(places.setdefault(place := request.scene(), place))
                     except SplitError as error:
                         problems.append(str(error))
     except InputError as error:

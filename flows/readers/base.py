@@ -3,7 +3,7 @@
 A reader is a module of this package with three names:
   LOOKS_FOR: str                      what makes a folder its own, in words (shown when no reader fits);
   detect(path) -> bool                whether the folder is its own, by a look at file names only;
-  read(path, image_folder, view_counts) -> Capture.
+  read(path, image_folder, view_counts) -> Capture; the reader of videos also takes `frames`.
 To add one: write the module, add its name to READERS where it should be tried.
 """
 

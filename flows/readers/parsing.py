@@ -65,7 +65,7 @@ def load_json(path: Path) -> Any:
 
 
 def load_arrays(path: Path, keys: list[str]) -> dict[str, np.ndarray]:
-    """Arrays of an .npz file, never unpickled. InputError for a missing key or a damaged file."""
+    """Arrays of an .npz file (all of them for no `keys`), never unpickled. InputError for a missing key or damage."""
     try:
         check_zip(path)
         with np.load(path, allow_pickle=False) as archive:

@@ -1,6 +1,7 @@
 """The report of an output folder: one self-contained HTML page, and the same tables as Markdown.
 
-Everything comes from what runs left behind (stores, Parquet tables); nothing is computed again.
+Everything comes from what runs left behind (stores, Parquet tables). Only the splats of the scene that the page holds
+are made, where none are kept from an earlier page or from the viewer.
 """
 
 from __future__ import annotations
@@ -66,7 +67,8 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
 
 
 def _write(out: Path, page: Path) -> None:
-    scenes = [scene_section(out, path) for path in sorted(out.glob("*.zarr"))]
+    measured = read_rows(out / "metrics", metric_table()).to_pylist()
+    scenes = [scene_section(out, path, measured) for path in sorted(out.glob("*.zarr"))]
     embed_scenes(out, scenes)
     rows, timings = summary_rows(out), timing_rows(out)
     tables = paper_tables(rows)
@@ -126,11 +128,11 @@ def _document(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
 
-def scene_section(out: Path, path: Path) -> dict[str, Any]:
-    """What the page shows of one scene: pictures of some held-out views per run, decisions, versions."""
+def scene_section(out: Path, path: Path, measured: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What the page shows of one scene: pictures of some held-out views per run, decisions, versions. measured: rows
+    of the metrics."""
     store = SceneStore.open(path)
     truths: dict[int, np.ndarray] = {}
-    measured = read_rows(out / "metrics", metric_table()).to_pylist()
     psnr = {(r["run"], r["view"]): r["psnr_db"] for r in reversed(measured) if r["scene_id"] == store.scene_id}
     runs = []
     for name in sorted(store.runs(), key=_run_order):

@@ -40,8 +40,8 @@ CAMERAS, POINTS = 60, 3000
 def turning_scene(store: SceneStore, run: Run, room: int) -> dict[str, Any] | None:
     """What the page embeds of a run, or a sentence on why it does not; None where there is no reconstruction yet.
 
-    room: bytes that are left. Keys: "splats" (base64 of a .splat file) and "cameras" (JSON,
-    with the sparse points), or "left_out".
+    room: bytes that are left. Keys: "splats" (base64 of a .splat file), "cameras" (JSON, with the sparse points),
+    "count" (of splats) and "bytes", or "left_out".
     """
     if store.record("reconstruct", run.name) is None:
         return None
@@ -57,7 +57,7 @@ def turning_scene(store: SceneStore, run: Run, room: int) -> dict[str, Any] | No
         encoded = base64.b64encode(file.read_bytes()).decode()
     points = scene_points(store)
     points = points[np.unique(np.linspace(0, len(points) - 1, min(POINTS, len(points))).round().astype(int))]
-    rows = camera_rows([*captured_views(store, run), *planned_views(run)])
+    rows = camera_rows([*captured_views(store, run, pictures=False), *planned_views(run, pictures=False)])
     cameras = json.dumps({"cameras": rows, "points": np.round(points.astype(float), 3).tolist()})
     size = len(encoded) + len(cameras)
     if size > room:

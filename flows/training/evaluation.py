@@ -64,7 +64,10 @@ def captured_group(scene: Path, size: int, given: int, views: int = 8) -> tuple[
     chosen = [*split["train"], *(test[row] for row in rows)]
     cameras = normalize_scene(capture.cameras, capture.points, capture.depth_bounds).cameras(capture.cameras)[chosen]
     boxes = source_boxes(cameras.size, "square").tolist()
-    squares = [square_image(read_image(capture.paths[i])[0], box, size) for i, box in zip(chosen, boxes, strict=True)]
+    squares = [
+        square_image(read_image(capture.paths[i], upright=capture.upright)[0], box, size)
+        for i, box in zip(chosen, boxes, strict=True)
+    ]
     images = torch.stack([torch.from_numpy(square).permute(2, 0, 1).float() / 255 for square in squares])
     return images, sample_cameras(cameras, "square", size)
 

@@ -101,9 +101,8 @@ class Viewer:
                     self._refresh(run)
                 except StoppedError:
                     return
-                except (
-                    Exception
-                ) as error:  # a store that is being written may be read too early: again at the next look
+                except Exception as error:
+                    # A store that is being written may be read too early: it is read again at the next look.
                     if describe(error) is None:
                         traceback.print_exc()
 
