@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DEMO_OUT ?= outputs/demo
 DEMO_ARGS ?=
 
-.PHONY: demo test test-slow lint docs figures setup clean
+.PHONY: demo test test-slow lint docs figures peers setup clean
 
 setup: $(VENV)/.installed
 
@@ -25,6 +25,8 @@ test-slow: setup
 
 lint: setup
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
+	$(BIN)/bandit --quiet --configfile pyproject.toml --recursive cat3d_core schemas flows infra
+	$(BIN)/python -m infra.audit
 
 # Reference pages from the code, then the site; a warning fails. The variable hides a notice about MkDocs 2.
 docs: setup
@@ -38,6 +40,10 @@ figures: setup
 	$(BIN)/cat3d sweep infra/docs/showcase.yaml --out outputs/showcase
 	$(BIN)/cat3d sweep infra/docs/quality.yaml --out outputs/quality
 	$(BIN)/python -m infra.docs.figures --showcase outputs/showcase --sweep outputs/quality
+
+# Programs of others, in an environment of their own, for `cat3d bench peers`. Nothing else needs it.
+peers:
+	PYTHON=$(PYTHON) sh infra/peers.sh
 
 clean:
 	rm -rf $(VENV) outputs build *.egg-info

@@ -1,7 +1,7 @@
 """The one similarity of a scene: it puts what the cameras look at at the origin, at distance 1, with +z up.
 
-The same similarity serves the raymaps of every group and the field (peers recompute it per chunk of views, so that
-two chunks of one scene are in different units; see the survey in the project's reference notes).
+The same similarity serves the raymaps of every group and the field. (Other programs compute it anew for each chunk of
+views, so that two chunks of one scene are in different units.)
 """
 
 from __future__ import annotations

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from cat3d_core.view_selection import consecutive_groups
+
 #: Captured views in a window of the second pass; of more, those nearest to its views.
 MOST_GIVEN = 8
 #: A first pass is one window up to so many times the trained number of views; then there are several.
@@ -35,7 +37,7 @@ class Layout(NamedTuple):
 def lay_out(path: Sequence[int], captured: int, views: int) -> Layout:
     """Windows of at most `views` views for targets whose path numbers are `path`, with so many captured views.
 
-    Raises ValueError where a window holds no captured view, a target and the anchors on either side of it.
+    Raises ValueError where `views` are too few for a captured view, two anchors and a view between them.
     """
     if views < 4:
         raise ValueError(f"Windows hold a captured view, two anchors and what lies between them; {views} are too few.")
@@ -45,7 +47,7 @@ def lay_out(path: Sequence[int], captured: int, views: int) -> Layout:
         return Layout([Window([], list(range(len(path))))], [], given)
     anchors = anchor_views(path, anchor_count(captured, len(path), views))
     longest = max(LONGEST_FIRST_PASS * views - captured, room)
-    first = [Window([], anchors[i : i + longest]) for i in range(0, len(anchors), longest)]
+    first = [Window([], part) for part in consecutive_groups(anchors, longest)]
     return Layout(first, _between(path, anchors, room), given)
 
 
@@ -81,10 +83,10 @@ def _between(path: Sequence[int], anchors: list[int], room: int) -> list[Window]
         if path[left] != path[right] or right - left < 2:
             continue
         inside = list(range(left + 1, right))
-        for piece in (inside[i : i + room - 2] for i in range(0, len(inside), room - 2)):
+        for piece in consecutive_groups(inside, room - 2):
             last = out[-1] if out else Window([], [])
             joined = [a for a in (left, right) if a not in last.anchors]
-            if out and left in last.anchors and len(last.anchors + last.targets + joined + piece) <= room:
+            if left in last.anchors and len(last.anchors + last.targets + joined + piece) <= room:
                 out[-1] = Window(last.anchors + joined, last.targets + piece)
             else:
                 out.append(Window([left, right], piece))

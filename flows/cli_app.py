@@ -35,7 +35,9 @@ OutOption = Annotated[
     Path,
     typer.Option("--out", "-o", help="Folder for stores, tables, pictures and the report.", callback=on_a_file_system),
 ]
-DownscaleOption = Annotated[float, typer.Option(help="Divide image width and height by this.")]
+DownscaleOption = Annotated[
+    float | None, typer.Option(help="Divide image width and height by this; without it, by what the preset can use.")
+]
 SeedOption = Annotated[int, typer.Option(help="All randomness follows from it.")]
 ReaderOption = Annotated[str, typer.Option(help="Layout of the folder; auto detects it.")]
 ImagesOption = Annotated[str | None, typer.Option(help="Image folder inside the scene, where there are several.")]

@@ -28,8 +28,8 @@ def describe(error: BaseException) -> str | None:
         return f"The system refused: {error.strerror}{where}. Free space or permissions may be missing."
     if type(error).__name__ in ("PrefectHTTPStatusError", "PrefectHTTPServerError"):  # Prefect is not imported for this
         return (
-            f"This command's Prefect server failed ({str(error).splitlines()[0]}). Most often the disk under --out is "
-            "full or cannot be written; OUT/.prefect/server.log says more. Free space and run again: "
-            "what is stored is kept."
+            f"The Prefect server failed ({str(error).splitlines()[0]}). Most often the disk under --out is full or "
+            "cannot be written; where PREFECT_API_URL is not set, OUT/.prefect/server.log says more. Free space and "
+            "run again: what is stored is kept."
         )
     return None

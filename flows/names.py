@@ -22,8 +22,19 @@ BYTES_PREFIX = "bytes:"
 RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 
 
+def decoded(name: str) -> str:
+    """A name whose bytes are UTF-8 as those say it, though Python read them otherwise, as it does in the locale C."""
+    if name.isprintable() or not _from_bytes(name):
+        return name
+    try:
+        return name.encode("utf-8", "surrogateescape").decode("utf-8")
+    except UnicodeDecodeError:
+        return name
+
+
 def shown(name: str) -> str:
     """The name as text without lone surrogates: bytes that are no UTF-8 are read as Latin-1, as they mostly are."""
+    name = decoded(name)
     try:
         name.encode("utf-8")
     except UnicodeEncodeError:
@@ -51,6 +62,7 @@ def safe_name(name: str) -> str:
     A plain name is its own. Any other keeps its readable part, with the first 8 hexadecimal digits of the sha256 of its
     bytes behind it, so that different names stay different.
     """
+    name = decoded(name)
     if PLAIN.fullmatch(name) and not RESERVED.fullmatch(name) and not name.endswith("."):
         return name
     ascii_part = unicodedata.normalize("NFKD", shown(name)).encode("ascii", "ignore").decode("ascii")

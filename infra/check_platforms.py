@@ -1,9 +1,9 @@
 """Whether cat3d's dependencies have wheels for other systems than this one: `python infra/check_platforms.py`.
 
 pip evaluates markers for the system it runs on, whatever `--platform` says, so they are evaluated here for each target
-and pip is asked for what remains, one dry run a system. Dependencies of dependencies are not looked at for the same
-reason. Asks the package index; installs nothing. Exit code 1 where something is missing that is not known to be
-(`LACKING`). The result is in docs/reference/platforms.md.
+and pip is asked for what remains, one dry run for each system and version of Python. Dependencies of dependencies are
+not looked at for the same reason. Asks the package index; installs nothing. Exit code 1 where something is missing that
+is not known to be (`LACKING`). The result is in docs/reference/platforms.md.
 """
 
 from __future__ import annotations

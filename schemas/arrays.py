@@ -7,6 +7,7 @@ the fill value: here it is an error. So empty (all-zero) chunks are always writt
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,10 @@ from schemas.errors import MissingError, StoreError
 
 #: Largest chunk of a `parameter` array (a hash grid has gigabytes; blosc and crc32c work on chunks in memory).
 PARAMETER_CHUNK_BYTES = 64 * 2**20
+
+
+#: Metadata that say more are not believed: a chunk is decoded in memory (blosc's own bound), and every one is a file.
+MAX_CHUNK_BYTES, MAX_CHUNKS = 2**31 - 1, 10_000_000
 
 
 @dataclass(frozen=True)
@@ -98,8 +103,12 @@ def open_array(folder: Path, writable: bool) -> zarr.Array:
         array = zarr.open_array(str(folder), mode="r+" if writable else "r", zarr_format=3)
     except FileNotFoundError:  # removed by a writer since its metadata was read
         raise MissingError(f"{folder} does not exist.") from None
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, LookupError, TypeError, ArithmeticError, AttributeError) as error:
         raise StoreError(f"{folder / 'zarr.json'} is damaged: {error}") from error
+    if 0 in array.chunks:
+        raise StoreError(f"{folder / 'zarr.json'} is damaged: it names chunks of {array.chunks} values.")
+    if math.prod(array.chunks) * array.dtype.itemsize > MAX_CHUNK_BYTES or math.prod(array.cdata_shape) > MAX_CHUNKS:
+        raise StoreError(f"{folder} has {array.shape} values in chunks of {array.chunks}, it says: none of ours has.")
     return array.with_config({"write_empty_chunks": True})  # not stored with the array, so set at every opening
 
 
@@ -133,7 +142,7 @@ def read(folder: Path, views: Sequence[int] | None = None) -> NDArray[Any]:
     """The whole array, or the given indices of its first axis, every chunk checked."""
     array = open_array(folder, writable=False)
     if views is None:
-        out = np.empty(array.shape, array.dtype)
+        out = _room(folder, array, array.shape)
         for chunk in chunk_coordinates(array):
             region = tuple(slice(i * n, (i + 1) * n) for i, n in zip(chunk, array.chunks))
             out[region] = read_chunk(folder, array, chunk)
@@ -141,12 +150,20 @@ def read(folder: Path, views: Sequence[int] | None = None) -> NDArray[Any]:
     rows = check_views(folder, views, array.shape)
     if array.chunks[0] != 1:
         return read(folder)[rows]
-    out = np.empty((len(rows), *array.shape[1:]), array.dtype)
+    out = _room(folder, array, (len(rows), *array.shape[1:]))
     for i, row in enumerate(read_views(folder, rows.tolist())):
         if isinstance(row, StoreError):
             raise row
         out[i] = row
     return out
+
+
+def _room(folder: Path, array: zarr.Array, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Memory for values of an array; the system gives it as it is filled."""
+    try:
+        return np.empty(shape, array.dtype)
+    except (MemoryError, ValueError) as error:
+        raise StoreError(f"{folder} has {shape} values, which memory does not hold ({error}).") from None
 
 
 def read_views(folder: Path, views: Sequence[int]) -> Iterator[NDArray[Any] | StoreError]:

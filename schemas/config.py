@@ -24,7 +24,7 @@ from pydantic import (
 from schemas.errors import ConfigError
 from schemas.execution import ExecutionConfig
 from schemas.hints import HintsConfig
-from schemas.settings import merged, spelled_out
+from schemas.settings import merged, shortened, spelled_out
 from schemas.skip import SkipConfig
 from schemas.strict import StrictModel as _Model
 
@@ -34,8 +34,8 @@ NonNegativeFloat = Annotated[FiniteFloat, Field(ge=0)]
 class IngestConfig(_Model):
     """Reading the photos."""
 
-    downscale: Annotated[FiniteFloat, Field(ge=1)] = 1
-    """Divide width and height by this."""
+    downscale: Annotated[FiniteFloat, Field(ge=1)] | None = None
+    """Divide width and height by this; None: as the preset and the device's memory suggest, small photos by 1."""
     max_pixels: PositiveInt = 100_000_000
     """Refuse larger source images, in pixels."""
     frames: Annotated[int, Field(ge=2)] = 60
@@ -93,9 +93,8 @@ class PlanConfig(_Model):
 class SampleConfig(_Model):
     """Sampling views from the diffusion model (paper, section 3.1).
 
-    solver, nodes, steps, guidance: None takes what the model's file recommends (a briefly trained model is at its best
-    after few steps without guidance), else the point on the measured front: unipc, log_snr, 10 steps, guidance 3.
-    """
+    solver, nodes, steps, guidance: None takes what the model's file recommends, else the point on the measured front:
+    unipc, log_snr, 10 steps, guidance 3."""
 
     generator: str | None = None
     """Generator: "cat3d", "seva", or that of an installed package; None: the one that recognises the checkpoint."""
@@ -110,8 +109,9 @@ class SampleConfig(_Model):
     guidance: NonNegativeFloat | None = None
     """Classifier-free guidance weight."""
     guidance_log_snr: tuple[FiniteFloat | None, FiniteFloat | None] | None = None
-    """Lowest and highest log-SNR at which guidance is on, where `skip.guidance` is; a bound of None: no bound.
-    None: up to 2, the interval on the measured front."""
+    """Lowest and highest log-SNR with guidance, under `skip.guidance`; a bound of None: none. None: up to 2."""
+    start: Literal["noise", "hint"] = "noise"
+    """From noise (paper) or, for models that take hints, later, from what the photos show of the view."""
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """Of the network; the sampler's state is float32 always. bfloat16 and float16 are for GPUs."""
 
@@ -228,7 +228,7 @@ def load_config(path: str | Path, model: type[BaseModel] = RunConfig) -> Any:
     except OSError as error:
         raise ConfigError(f"{path} can't be read: {error.strerror}.") from None
     try:
-        document = json.loads(text) if path.suffix == ".json" else yaml.load(text, _UniqueKeys)
+        document = json.loads(text) if path.suffix == ".json" else yaml.load(text, _UniqueKeys)  # nosec B506
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         kind = "JSON" if path.suffix == ".json" else "YAML"
         raise ConfigError(f"{path} is not valid {kind}: {' '.join(str(error).split())}.") from None
@@ -259,7 +259,7 @@ def _sentence(source: str, error: dict[str, Any], model: type[BaseModel]) -> str
     if isinstance(cause := error.get("ctx", {}).get("error"), ConfigError):
         return f"{source}: {cause}"
     message = error["msg"][0].lower() + error["msg"][1:]
-    return f"{source}: {field} is {error['input']!r}, but {message}."
+    return f"{source}: {field} is {shortened(error['input'])}, but {message}."
 
 
 def _known(location: tuple[Any, ...], model: type[BaseModel]) -> str:

@@ -2,11 +2,13 @@
 
 Metadata (`zarr.json`) is written here and not by zarr-python, because zarr writes the bare token NaN (not JSON) and has
 no checksum, so that one flipped bit makes 2 views of 3. The checksum is the attribute `SEAL`, over everything else in
-the document. What a power cut can leave half-written is found by checksums; only records of completion are synced.
+the document. Groups and records of completion are synced, and a stage's data before its record; what else a
+power cut can leave half-written is found by checksums and made again.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -107,6 +109,7 @@ def discard(folder: Path) -> bool:
         folder.rename(trash)
     except FileNotFoundError:
         return False
+    sync_folder(folder.parent)  # else a power cut could bring it back, a record without its data
     shutil.rmtree(trash)
     return True
 
@@ -148,7 +151,7 @@ def nodes(root: Path, path: str = "") -> Iterator[tuple[str, str]]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make renames in `folder` durable."""
+    """Make renames in `folder`, or the content of a file, survive a power cut."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -156,17 +159,35 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
+def sync_tree(root: Path, since_s: float = 0.0) -> None:
+    """Make every file and folder below `root` that changed since a time (as time.time() gives it) survive a power cut.
+    What goes away meanwhile is passed over."""
+    for folder, _, files in os.walk(root):
+        for path in (*(Path(folder, name) for name in files), Path(folder)):
+            with contextlib.suppress(FileNotFoundError):
+                if path.stat().st_mtime >= since_s:
+                    sync_folder(path)
+
+
 def write_metadata(folder: Path, document: Mapping[str, Any], durable: bool = False) -> None:
     """Write the `zarr.json` of a group or array, with its checksum."""
     sealed = {**document, "attributes": {**document["attributes"], SEAL: _seal(document)}}
+    is_new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    write_bytes(folder / "zarr.json", json.dumps(sealed, indent=2, allow_nan=False).encode(), durable)
+    try:
+        write_bytes(folder / "zarr.json", json.dumps(sealed, indent=2, allow_nan=False).encode(), durable)
+    except BaseException:
+        if is_new:  # a folder without a document is damage to whoever looks at the store
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
 
 
-def write_group(folder: Path, attributes: Mapping[str, Any], durable: bool = False) -> None:
-    """Make `folder` a Zarr v3 group with these attributes, or replace the attributes of the one that is there."""
+def write_group(folder: Path, attributes: Mapping[str, Any]) -> None:
+    """Make `folder` a Zarr v3 group with these attributes, or replace the attributes of the one that is there. Durable,
+    because without its groups nothing of a store can be read."""
     attributes = plain(attributes, f"attributes of {folder.name}")
-    write_metadata(folder, {"zarr_format": 3, "node_type": "group", "attributes": attributes}, durable)
+    write_metadata(folder, {"zarr_format": 3, "node_type": "group", "attributes": attributes}, durable=True)
 
 
 def read_metadata(folder: Path) -> dict[str, Any]:
@@ -179,7 +200,7 @@ def read_metadata(folder: Path) -> dict[str, Any]:
         document = json.loads(path.read_bytes(), parse_constant=_refuse_constant)
     except (FileNotFoundError, NotADirectoryError):
         raise MissingError(f"{path} does not exist.") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise StoreError(f"{path} is damaged: it isn't JSON ({error}).") from None
     if not isinstance(document, dict) or document.get("node_type") not in ("group", "array"):
         raise StoreError(f"{path} is damaged: it describes neither a Zarr group nor a Zarr array.")

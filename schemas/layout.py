@@ -1,7 +1,7 @@
 """The layout of a scene store: every array it may hold, what it means, how it is stored and which stage writes it.
 
     scene.zarr/  captured/  latents/  stages/<stage>/
-                 runs/<run>/  plan/  generated/  field/  renders/<kind>/  stages/<stage>/
+                 runs/<run>/  plan/  hints/  generated/  field/  renders/<kind>/  stages/<stage>/
 
 Every array carries the names of its dimensions, its unit and its meaning, so that xarray opens each section as a
 dataset and the whole store as a tree.
@@ -73,10 +73,11 @@ def _marker(path: str, view: Dim, stage: str, note: str = "") -> ArraySpec:
     return ArraySpec(path, "key", "uint8", (view, BYTE), stage, "1", f"content key of each view, 0 = not done{note}")
 
 
-def _cameras(section: str, view: Dim, stage: str) -> tuple[ArraySpec, ...]:
-    """The arrays that hold the cameras of a section's views, but for their sizes."""
+def _cameras(section: str, view: Dim, stage: str, first: str | None = None) -> tuple[ArraySpec, ...]:
+    """The arrays that hold the cameras of a section's views, but for their sizes. first: the stage that writes K before
+    `stage` does, where it is given: that one has to be done again for a damaged K."""
     return (
-        ArraySpec(f"{section}/intrinsics", "small", "float64", (view, K_ROW, K_COLUMN), stage, "px", "K"),
+        ArraySpec(f"{section}/intrinsics", "small", "float64", (view, K_ROW, K_COLUMN), first or stage, "px", "K"),
         ArraySpec(
             f"{section}/world_from_camera",
             "small",
@@ -104,7 +105,7 @@ LAYOUT: tuple[ArraySpec, ...] = (
               coordinate=True),
     ArraySpec("captured/source_sha256", "small", "str", (VIEW,), "ingest", "",
               "sha256 of the source file, hexadecimal"),
-    *_cameras("captured", VIEW, "poses"),
+    *_cameras("captured", VIEW, "poses", "ingest"),
     ArraySpec("captured/registered", "small", "bool", (VIEW,), "poses", "1", "whether the view's pose is known"),
     ArraySpec("captured/points", "parameter", "float32", (POINT, XYZ), "poses", "scene unit",
               "sparse points, scene frame"),

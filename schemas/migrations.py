@@ -1,6 +1,7 @@
 """Migrations of a scene store from one schema version to the next.
 
-Each is safe to be killed and run again: every step leaves what is already done alone, and the version is written last.
+Each is safe to be killed and run again: every step leaves what is already done alone, and the version is written last,
+when all else is on the disk.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from schemas.documents import nodes, read_group, read_metadata, write_group, write_metadata
+from schemas.documents import nodes, read_group, read_metadata, sync_tree, write_group, write_metadata
 from schemas.errors import StoreError
 from schemas.layout import SCENE_STAGES, SCHEMA_VERSION, describe
 
@@ -32,6 +33,7 @@ def _from_0(store: Path) -> None:
     similarity = attributes.pop("similarity", None)
     if similarity is not None:
         write_group(store / "captured", {**read_group(store / "captured"), "similarity": similarity})
+    sync_tree(store)
     write_group(store, {**attributes, "schema_version": 1})
 
 
@@ -44,6 +46,7 @@ def _from_1(store: Path) -> None:
             described = {**document, "attributes": {**document["attributes"], **attributes}, "dimension_names": names}
             if described != document:
                 write_metadata(store / path, described)
+    sync_tree(store)
     write_group(store, {**read_group(store), "schema_version": 2})
 
 

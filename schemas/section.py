@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas import arrays
-from schemas.documents import checked_name, discard, plain, read_group, write_group
+from schemas.documents import checked_name, discard, plain, read_group, sync_folder, write_group
 from schemas.errors import MissingError, StoreError
 from schemas.layout import array_spec, describe
 
@@ -163,6 +163,7 @@ def make_tree(folder: Path, attributes: Mapping[str, Any], groups: Sequence[str]
             write_group(temporary / name, {})
         write_group(temporary, attributes)
         temporary.rename(folder)
+        sync_folder(folder.parent)
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
         if (folder / "zarr.json").exists():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from reprlib import Repr
 from typing import Any
 
 import yaml
@@ -22,13 +23,21 @@ def spelled_out(document: dict[str, Any]) -> dict[str, Any]:
         return document
     rest = {name: value for name, value in document.items() if name != "method"}
     name, own = document["method"], document.get("generate")
-    if name not in METHODS:
-        raise ConfigError(f"method is {name!r}; it may be {', '.join(METHODS)}.")
+    if not isinstance(name, str) or name not in METHODS:
+        raise ConfigError(f"method is {shortened(name)}; it may be {', '.join(METHODS)}.")
     if own not in (None, METHODS[name]):
         raise ConfigError(
             f"method {name} stands for generate {METHODS[name]}, but generate is {own}: give one of them."
         )
     return rest | {"generate": METHODS[name]}
+
+
+def shortened(value: Any) -> str:
+    """The value as it is written, cut short: a few lines of YAML can stand for any number of them."""
+    form = Repr()
+    form.maxstring = form.maxother = form.maxlong = 200
+    form.maxlevel = 3
+    return form.repr(value)
 
 
 def merged(*documents: dict[str, Any]) -> dict[str, Any]:

@@ -36,7 +36,8 @@ class SkipConfig(StrictModel):
     """Reconstruct: pixels of generated views finer than those of the finest captured view."""
     seen: bool = True
     """Reconstruct: pixels of generated views whose place two captured views show as well, and the share of rays that
-    such pixels would have had."""
+    such pixels would have had; also all generated views, where such pixels are half of theirs and there are more than
+    three captured views."""
     empty_space: bool = False
     """Reconstruct, render: queries of the field behind what stops all but a hundredth of a ray's light."""
     proposals: bool = True

@@ -55,7 +55,7 @@ def read_record(stages: Path, stage: str) -> StageRecord | None:
 
 def write_record(stages: Path, record: StageRecord) -> None:
     """Write or replace a record, atomically and durably."""
-    write_group(stages / record.stage, plain(record, f"record of {record.stage}"), durable=True)
+    write_group(stages / record.stage, plain(record, f"record of {record.stage}"))
 
 
 def remove_record(stages: Path, stage: str) -> bool:

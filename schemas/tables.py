@@ -21,6 +21,8 @@ from schemas.errors import StoreError
 
 #: Entry of a file's metadata that holds the checksum of its rows; files of other programs have none.
 SEAL = b"rows_sha256"
+#: Files that say more are not read: a few bytes can stand for any number of equal rows.
+MAX_ROWS = 10_000_000
 
 
 def column(name: str, kind: pa.DataType, meaning: str, unit: str = "", required: bool = False) -> pa.Field:
@@ -135,12 +137,15 @@ def read_rows(folder: str | Path, schema: pa.Schema | None = None) -> pa.Table:
 
 def _read_file(path: Path) -> pa.Table:
     try:
-        table = pq.ParquetFile(path, page_checksum_verification=True).read()
+        file = pq.ParquetFile(path, page_checksum_verification=True)
+        if file.metadata.num_rows > MAX_ROWS:
+            raise pa.ArrowInvalid(f"it says that it has {file.metadata.num_rows} rows, and none of ours has {MAX_ROWS}")
+        table = file.read()
         metadata = dict(table.schema.metadata or {})
         sealed = metadata.pop(SEAL, None)
         if sealed is not None and sealed != _digest(table):
             raise pa.ArrowInvalid("its rows don't match their checksum")
-    except (pa.ArrowException, OSError, ValueError) as error:
+    except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
         raise StoreError(f"{path} is damaged: {error}. Remove it and evaluate again.") from error
     return table.replace_schema_metadata(metadata)
 

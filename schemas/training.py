@@ -47,6 +47,11 @@ class SceneBankConfig(_Model):
     procedural scenes, each of their five kinds of camera paths a family of its own."""
     world_groups: PositiveInt = 600
     """Captures of these worlds, if there are any."""
+    others: tuple[Path, ...] = ()
+    """With hints: folders of more scenes (renders/*.safetensors), such as the bank of a training of the sweep, whose
+    first shard is left out here as it is there."""
+    sweep: Path | None = None
+    """With hints: the plane sweep that predicts them; None: the one shipped."""
     textures: Path | None = None
     """Folder of photographs (.jpg) to cut textures from, beside the procedural ones."""
     folder: Path | None = None
@@ -89,6 +94,8 @@ class OptimizerConfig(_Model):
     drop: Literal["images_and_poses", "images"] = "images_and_poses"
     """What such groups do without (paper: both)."""
     weight_decay: Annotated[FiniteFloat, Field(ge=0)] = 0.01
+    hint_weight: Annotated[FiniteFloat, Field(ge=0, le=1)] = 0.25
+    """With hints: weight of the loss where a hint is wholly certain; there the finished view shows the hint."""
     clip_norm: PositiveFloat = 1.0
     ema_decay: Share = 0.9995
     min_snr_gamma: PositiveFloat | None = None

@@ -54,6 +54,43 @@ def test_generated_pages_are_what_the_code_says() -> None:
     assert not stale(), f"Write them with `make docs`: {stale()}"
 
 
+@pytest.mark.parametrize("page", [p for p in PAGES if p not in FREE], ids=lambda p: str(p.relative_to(ROOT)))
+def test_commands_and_options_of_the_documents_exist(page: Path) -> None:
+    """Every `cat3d NAME --option`, and every setting of a run that is given by --set."""
+    import typer
+
+    from flows.cli import app
+
+    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    wrong = []
+    for name, rest in re.findall(r"(?:^    |`)cat3d ([a-z-]+)([^`#\n]*)", page.read_text(), re.M):
+        if name not in commands:
+            wrong.append(f"cat3d {name}")
+            continue
+        known = {
+            option for parameter in commands[name].params for option in (*parameter.opts, *parameter.secondary_opts)
+        }
+        options = re.findall(r"(?<!\S)--?[a-z][a-z-]*", rest)
+        wrong += [f"cat3d {name} {option}" for option in options if option not in known]
+        if name in ("run", "plan", "reprocess"):
+            wrong += [f"--set {path}" for path in re.findall(r"--set ([\w.]+)=", rest) if not is_setting(path)]
+    assert not wrong, f"{page.relative_to(ROOT)}: {wrong}"
+
+
+def is_setting(path: str) -> bool:
+    """Whether a run has the setting; below a field that holds a mapping anything may stand."""
+    from schemas.config import RunConfig
+
+    model = RunConfig
+    for part in path.split("."):
+        if not hasattr(model, "model_fields"):
+            return True
+        if part not in model.model_fields:
+            return part == "method"  # the short name of `generate`
+        model = model.model_fields[part].annotation
+    return True
+
+
 def prose(page: Path) -> list[str]:
     """Lines of a page outside of code blocks, tables and comments, which hold what programs wrote."""
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.M | re.S)
@@ -85,3 +122,31 @@ def test_readme_is_short_and_shows_pictures() -> None:
     assert len(pictures) >= 5
     assert all(picture.stat().st_size < PICTURE_BYTES for picture in pictures)
     assert not re.findall(r"!\[\]", readme.read_text()), "every picture has alternative text"
+
+
+def test_readmes_table_of_quality(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Means over scenes, errors over seeds, gain, and what the numbers are of; nothing of other splits."""
+    from infra.docs import quality
+
+    def row(method: str, seed: int, psnr: float, split: str = "3") -> dict[str, object]:
+        return {
+            "dataset": "llff",
+            "scene_id": "a",
+            "method": method,
+            "split": split,
+            "seed": seed,
+            "protocol": "google",
+            "psnr_db": psnr,
+        }
+
+    rows = [row("zipnerf", 0, 20.0), row("zipnerf", 1, 22.0), row("cat3d", 0, 24.0), row("cat3d", 1, 25.0)]
+    rows += [row("cat3d", 0, 99.0, "6"), row("other", 0, 99.0)]
+    monkeypatch.setattr(quality, "summary_rows", lambda _: rows)
+    monkeypatch.setattr(quality, "_last_day", lambda _: "2026-11-28")
+    text = quality.table(tmp_path)
+    assert "| things before a wall, from the front | 21.0 ± 1.0 | 24.5 ± 0.5 | +3.5 ± 1.1 ≈ | +4.3 |" in text
+    prose = " ".join(text.split("\n\n")[1].split())
+    assert "one scene a row; ± is the standard error over two seeds" in prose
+    rows[:] = rows[:2]
+    with pytest.raises(ValueError, match="no data set with 3 views of both zipnerf and cat3d"):
+        quality.table(tmp_path)

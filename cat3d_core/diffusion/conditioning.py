@@ -14,26 +14,33 @@ Drop = Literal["images_and_poses", "images"]
 
 class Condition(NamedTuple):
     """latents [G, M, C, h, w] of the conditioning views; cameras [G, M+N, 4, 4], `rays.reference_from_image` of each
-    view with the first conditioning camera as the reference; mask [G, M+N], 1 = given."""
+    view with the first conditioning camera as the reference; mask [G, M+N], 1 = given; hints [G, M+N, C + 4, h, w] of
+    what is known of the targets (hints.py), zero for given views, or None."""
 
     latents: Tensor
     cameras: Tensor
     mask: Tensor
+    hints: Tensor | None = None
 
 
-def make_condition(latents: Tensor, cameras: Tensor) -> Condition:
-    """The first M of the cameras are the conditioning views'."""
+def make_condition(latents: Tensor, cameras: Tensor, hints: Tensor | None = None) -> Condition:
+    """The first M of the cameras are the conditioning views'; hints [G, N, C + 4, h, w] of the others."""
+    given = latents.shape[1]
     mask = torch.zeros(cameras.shape[:2], device=cameras.device)
-    mask[:, : latents.shape[1]] = 1
-    return Condition(latents, cameras, mask)
+    mask[:, :given] = 1
+    if hints is not None:
+        hints = torch.cat([hints.new_zeros(len(hints), given, *hints.shape[2:]), hints], 1)
+    return Condition(latents, cameras, mask, hints)
 
 
 def drop_condition(condition: Condition, dropped: Tensor, what: Drop) -> Condition:
-    """The null condition for the groups where `dropped` [G] (bool): conditioning latents and mask become zero, and so
-    do all cameras, and with them the rays, unless only images are dropped."""
+    """The null condition for the groups where `dropped` [G] (bool): conditioning latents, hints and mask become zero,
+    and so do all cameras, and with them the rays, unless only images are dropped."""
     keep = ~dropped
+    maps = keep[:, None, None, None, None]
     cameras = condition.cameras * keep[:, None, None, None] if what == "images_and_poses" else condition.cameras
-    return Condition(condition.latents * keep[:, None, None, None, None], cameras, condition.mask * keep[:, None])
+    hints = None if condition.hints is None else condition.hints * maps
+    return Condition(condition.latents * maps, cameras, condition.mask * keep[:, None], hints)
 
 
 def ray_features(raymaps: Tensor, octaves: int) -> Tensor:

@@ -13,6 +13,10 @@ ViewAttention = Literal["3d", "temporal", "none"]
 CameraInput = Literal["raymap", "vector"]
 Prediction = Literal["v", "eps"]
 
+#: Maps of what is known of a target beside its colour: share that lies inside some photo, how far the colour is right,
+#: inverse depth, its spread (see hints.py).
+HINT_MAPS = ("seen", "confidence", "inverse_depth", "spread")
+
 
 @dataclass(frozen=True)
 class AutoencoderConfig:
@@ -40,6 +44,7 @@ class UNetConfig:
     ray_octaves: sines and cosines of the ray channels at this many octaves are concatenated too (0: the rays alone).
     relative_cameras: 3D attention carries its vectors from camera to camera (attention.ViewFrames): not in the paper,
     and without weights of its own.
+    hints: further input channels for what is known of targets beforehand (hints.py): not in the paper.
     """
 
     latent_channels: int = 8
@@ -57,6 +62,7 @@ class UNetConfig:
     cross_attention_dim: int = 1024
     ray_octaves: int = 0
     relative_cameras: bool = False
+    hints: bool = False
 
     def __post_init__(self) -> None:
         levels = len(self.channels)
@@ -77,8 +83,14 @@ class UNetConfig:
 
     @property
     def input_channels(self) -> int:
-        """Latent, mask and (unless the camera enters as a vector) raymap channels."""
-        return self.latent_channels + 1 + (6 * (1 + 2 * self.ray_octaves) if self.camera == "raymap" else 0)
+        """Latent, mask, (unless the camera enters as a vector) raymap and hint channels."""
+        rays = 6 * (1 + 2 * self.ray_octaves) if self.camera == "raymap" else 0
+        return self.latent_channels + 1 + rays + self.hint_channels
+
+    @property
+    def hint_channels(self) -> int:
+        """The last of the input channels: latents of the warped picture and the maps of HINT_MAPS, or none."""
+        return self.latent_channels + len(HINT_MAPS) if self.hints else 0
 
     def level_attention(self, level: int, decoder: bool) -> ViewAttention:
         """How views meet at this level."""

@@ -38,7 +38,13 @@ def guided(
     if not config.active(log_snr):
         return predict(condition, x)
     groups = x.shape[0]
-    doubled = Condition(*(torch.cat([part, part]) for part in condition))
+    latents, cameras, mask, hints = condition
+    doubled = Condition(
+        torch.cat([latents, latents]),
+        torch.cat([cameras, cameras]),
+        torch.cat([mask, mask]),
+        None if hints is None else torch.cat([hints, hints]),
+    )
     dropped = torch.arange(2 * groups, device=x.device) >= groups
     both = predict(drop_condition(doubled, dropped, config.drop), torch.cat([x, x]))
     conditional, unconditional = both[:groups], both[groups:]

@@ -17,7 +17,7 @@ from torch import Tensor
 from cat3d_core.diffusion.config import UNetConfig
 from cat3d_core.diffusion.ldm_names import from_ldm
 from cat3d_core.diffusion.unet import MultiViewUNet
-from cat3d_core.seva.checkpoint import NO_START, is_seva
+from cat3d_core.seva.checkpoint import NO_START, find_seva, is_seva
 
 _TEXT = re.compile(r"(.*\.transformer_blocks\.\d+)\.(attn2|norm2)\.")
 
@@ -94,8 +94,8 @@ def inflate(unet: MultiViewUNet, weights: dict[str, Tensor], text_token: Tensor 
 
 
 def export_2d(unet: MultiViewUNet, latent_channels: int | None = None) -> dict[str, Tensor]:
-    """The 2D network inside: diffusers keys, raymap and mask channels cut off, text attention that adds nothing left
-    out. `inflate` of the result gives the same network as long as rays and mask had no effect yet."""
+    """The 2D network inside: diffusers keys; raymap, mask and hint channels cut off; text attention that adds nothing
+    left out. `inflate` of the result gives the same network as long as rays and mask had no effect yet."""
     keep = latent_channels or unet.config.latent_channels
     state = {k: v.detach().clone() for k, v in unet.state_dict().items() if "_views." not in k}
     state["conv_in.weight"] = state["conv_in.weight"][:, :keep]
@@ -109,6 +109,8 @@ def _read(path: Path) -> tuple[dict[str, Tensor], Any]:
     if path.is_dir():
         found = sorted(folder.glob("diffusion_pytorch_model*.safetensors"))
         if not found:
+            if (seva := find_seva(path)) is not None:
+                raise ValueError(NO_START.format(path=seva))
             raise ValueError(f"There is no diffusion_pytorch_model*.safetensors in {folder}.")
         file = next((f for f in found if f.name == "diffusion_pytorch_model.safetensors"), found[0])
     if not file.is_file():

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from cat3d_core.diffusion.conditioning import Drop, drop_condition, make_condition
+from cat3d_core.diffusion.hints import CONFIDENCE, corrupted
 from cat3d_core.diffusion.model import MultiViewModel
 from cat3d_core.diffusion.schedule import Schedule, alpha_sigma
 from cat3d_core.diffusion.unet import MultiViewUNet
@@ -24,8 +25,10 @@ class TrainConfig:
     'small'.
 
     total_steps counts optimizer steps; the learning rate rises linearly for `warmup_steps`, then follows a half cosine
-    down to `final_learning_rate` at total_steps. accumulate: calls of `step` per optimizer step. min_snr_gamma: weight
-    of Hang et al. 2023 (None: uniform). precision: bfloat16 keeps float32 master weights.
+    down to `final_learning_rate` at total_steps. accumulate: calls of `step` per optimizer step. hint_weight: weight of
+    the loss where a hint is wholly certain, as against 1 where it is not: there the finished view shows the hint and
+    not the sample. min_snr_gamma: weight of Hang et al. 2023 (None: uniform). precision: bfloat16 keeps float32 master
+    weights.
     """
 
     learning_rate: float = 5e-5
@@ -38,6 +41,7 @@ class TrainConfig:
     accumulate: int = 1
     drop_probability: float = 0.1
     drop: Drop = "images_and_poses"
+    hint_weight: float = 0.25
     min_snr_gamma: float | None = None
     precision: Literal["float32", "bfloat16"] = "bfloat16"
 
@@ -61,11 +65,12 @@ def diffusion_loss(
     n_condition: int,
     random: torch.Generator,
     config: TrainConfig,
+    hints: Tensor | None = None,
 ) -> Tensor:
     """Mean squared error of the prediction on target views, one value per group [G] float32.
 
     latents [G, V, C, h, w] clean, conditioning views first (they stay clean); cameras [G, V, 4, 4] as
-    the network wants them. Noise levels are
+    the network wants them; hints [G, N, C + 4, h, w] of the targets, corrupted here. Noise levels are
     stratified over the groups. `random` is a CPU generator, so the draw is the same on every device.
     """
     groups = latents.shape[0]
@@ -77,11 +82,17 @@ def diffusion_loss(
     noise = torch.randn(clean.shape, generator=random).to(clean.device)
     alpha, sigma = (s.float().to(clean.device)[:, None, None, None, None] for s in alpha_sigma(log_snr))
     noisy = alpha * clean + sigma * noise
-    condition = drop_condition(make_condition(latents[:, :n_condition], cameras), dropped.to(clean.device), config.drop)
+    told = None if hints is None else corrupted(hints, random)
+    condition = drop_condition(
+        make_condition(latents[:, :n_condition], cameras, told), dropped.to(clean.device), config.drop
+    )
     time = schedule.time(log_snr).float().to(clean.device)
-    output = unet(torch.cat([condition.latents, noisy], 1), time, condition.cameras, condition.mask)
+    output = unet(torch.cat([condition.latents, noisy], 1), time, condition.cameras, condition.mask, condition.hints)
     target = alpha * noise - sigma * clean if schedule.config.prediction == "v" else noise
-    error = (output[:, n_condition:].float() - target).square().mean((1, 2, 3, 4))
+    square = (output[:, n_condition:].float() - target).square()
+    if told is not None:
+        square = square * (1 - (1 - config.hint_weight) * told[:, :, CONFIDENCE, None].float())
+    error = square.mean((1, 2, 3, 4))
     return error * _snr_weight(log_snr, schedule.config.prediction, config.min_snr_gamma).to(error)
 
 
@@ -128,8 +139,9 @@ class Trainer:
         """Optimizer steps made."""
         return self.calls // self.config.accumulate
 
-    def step(self, latents: Tensor, cameras: Tensor, n_condition: int) -> dict[str, float]:
-        """One batch: latents [G, V, C, h, w], cameras [G, V, 4, 4], conditioning views first.
+    def step(self, latents: Tensor, cameras: Tensor, n_condition: int, hints: Tensor | None = None) -> dict[str, float]:
+        """One batch: latents [G, V, C, h, w], cameras [G, V, 4, 4], conditioning views first; hints [G, N, C + 4, h, w]
+        of the others, for a network that takes them.
 
         Returns numbers to log: step, loss, lr, grad_norm (nan unless this call ended an accumulation). Raises
         FloatingPointError if the loss or the gradient is not finite; the weights are then those of the last good step.
@@ -138,7 +150,8 @@ class Trainer:
         schedule = Schedule(self.model_config.schedule, latents.shape[1] - n_condition)
         random = generator(self.seed, "train", self.calls, rank)
         latents, cameras = latents.to(self.device), cameras.to(self.device)
-        loss = diffusion_loss(self.unet, schedule, latents, cameras, n_condition, random, self.config).mean()
+        hints = None if hints is None else hints.to(self.device)
+        loss = diffusion_loss(self.unet, schedule, latents, cameras, n_condition, random, self.config, hints).mean()
         value = float(loss.detach())
         if not math.isfinite(value):
             raise FloatingPointError(f"The training loss is {value} at step {self.steps}; lower the learning rate.")

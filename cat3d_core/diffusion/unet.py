@@ -16,8 +16,8 @@ from cat3d_core.rays import matrix_rays
 class MultiViewUNet(nn.Module):
     """Parameters have the key names of diffusers' UNet2DConditionModel.
 
-    At initialisation the output does not depend on rays and mask (their input channels are zero), so that an inflated
-    pretrained network starts as the network it was. Residual branches and the output start at zero, as in LDM.
+    At initialisation the output does not depend on rays, mask and hints (their input channels are zero), so that an
+    inflated pretrained network starts as the network it was. Residual branches and the output start at zero, as in LDM.
     """
 
     def __init__(self, config: UNetConfig) -> None:
@@ -57,12 +57,15 @@ class MultiViewUNet(nn.Module):
             elif isinstance(module, SpatialTransformer):
                 zero_(module.proj_out)
 
-    def forward(self, latents: Tensor, time: Tensor, cameras: Tensor, mask: Tensor) -> Tensor:
+    def forward(
+        self, latents: Tensor, time: Tensor, cameras: Tensor, mask: Tensor, hints: Tensor | None = None
+    ) -> Tensor:
         """Predict v or eps for every view.
 
         latents [G, V, C, h, w]: clean where conditioning, noisy where target; time [G] the network's time, any float;
         cameras [G, V, 4, 4] seen from the first conditioning camera (`rays.reference_from_image`; zeros where the
-        pose is dropped), best in float64; mask [G, V], 1 = conditioning view.
+        pose is dropped), best in float64; mask [G, V], 1 = conditioning view; hints [G, V, C + 4, h, w], zero where
+        nothing is known (None: of no view), for a network that takes them.
         Returns [G, V, C, h, w] in the dtype of the weights.
         """
         groups, views, channels, height, width = latents.shape
@@ -77,6 +80,9 @@ class MultiViewUNet(nn.Module):
             parts.insert(
                 1, ray_features(matrix_rays(cameras, height, width).to(latents.dtype), self.config.ray_octaves)
             )
+        if self.config.hints:
+            empty = latents.new_zeros(groups, views, self.config.hint_channels, height, width)
+            parts.append(empty if hints is None else hints.to(latents.dtype))
         x = torch.cat(parts, 2).flatten(0, 1).to(dtype)
         context = None
         if self.config.camera == "vector":

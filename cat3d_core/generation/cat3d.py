@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from cat3d_core.diffusion.config import ModelConfig, UNetConfig
+from cat3d_core.diffusion.hints import hint_latents
 from cat3d_core.diffusion.memory import multiview_need
 from cat3d_core.diffusion.model import MultiViewModel
 from cat3d_core.diffusion.sampler import SamplerConfig, evaluations, sample
@@ -44,13 +45,14 @@ def cat3d_spec(
         advice=replace(MEASURED, guidance=guidance, **advised),
         reference=replace(PAPER, guidance=replace(PAPER.guidance, scale=guidance.scale)),
         cost=partial(_cost, config),
+        wants=frozenset({"hints"}) if config.unet.hints else frozenset(),
         need=partial(multiview_need, config) if count_parameters(config.unet) > _LARGE else None,
     )
 
 
 def _cost(config: ModelConfig, given: int, targets: int, sampler: SamplerConfig) -> Cost:
     # Padded groups cost what full ones do.
-    count = evaluations(sampler, Schedule(config.schedule, config.views - given))
+    count = evaluations(sampler, Schedule(config.schedule, config.views - given), config.unet.hints)
     return Cost(count, count * _flops(config.unet, config.views))
 
 
@@ -86,7 +88,7 @@ class Cat3dGenerator:
         ValueError for more views than the model takes.
         """
         at_once = sampler.micro_batch or 1
-        for _, alike in groupby(groups, lambda group: (len(group.latents), len(group.noise))):
+        for _, alike in groupby(groups, lambda group: (len(group.latents), len(group.noise), bool(group.hints))):
             while batch := list(islice(alike, at_once)):
                 yield from self._together(batch, sampler, at_once)
 
@@ -95,9 +97,12 @@ class Cat3dGenerator:
         latents = torch.stack([group.latents for group in groups]).to(self.device)
         noise = torch.stack([group.noise for group in groups]).to(self.device)
         cameras = torch.stack([_matrices(group) for group in groups]).to(self.device)
+        hints = None
+        if "hints" in self.spec.wants and groups[0].hints:
+            hints = torch.stack([hint_latents(self.model.autoencoder, group.hints) for group in groups])
 
         def work(count: int) -> Tensor:
-            return sample(self.model, latents, cameras, noise, replace(sampler, micro_batch=count)).cpu()
+            return sample(self.model, latents, cameras, noise, replace(sampler, micro_batch=count), hints).cpu()
 
         return self._memory.run(work, at_once, f"group of {cameras.shape[1]} views")
 

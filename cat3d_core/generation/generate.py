@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -17,12 +17,14 @@ def generate(
     scenes: Sequence[tuple[Tensor, Cameras]],
     sampler: SamplerConfig,
     noise: Callable[[int, int], Tensor],
+    hints: Sequence[Mapping[str, Tensor]] = (),
 ) -> list[Tensor]:
     """Images (N, 3, H, W) in [0, 1] of the target views of each scene.
 
     scenes: images (M, 3, H, W) in [0, 1] of the given views, and the M + N cameras of given and target views, scene
-    frame. noise(scene, view) -> (C, h, w), standard normal; views are counted from the first given one. More targets
-    than the generator takes at once are sampled in several groups.
+    frame. noise(scene, view) -> (C, h, w), standard normal; views are counted from the first given one. hints: of the
+    targets of each scene (`ViewGroup.hints`), if there are any. More targets than the generator takes at once are
+    sampled in several groups.
     """
     latents = [generator.encode(images) for images, _ in scenes]
     groups, scene_of = [], []
@@ -38,6 +40,7 @@ def generate(
                 torch.stack([noise(number, view) for view in targets]),
                 images=images,
                 scene=cameras[:given],
+                hints={name: m[[t - given for t in targets]] for name, m in hints[number].items()} if hints else {},
             )
             groups.append(group)
             scene_of.append(number)

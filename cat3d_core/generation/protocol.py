@@ -63,9 +63,10 @@ class ViewGroup:
     latents (M, C, h, w) float32 of the given views, as `encode` made them; cameras: M + N, given ones first, of images
     of the generator's size, in the scene frame (mean distance 1, +z up); noise (N, C, h, w) standard normal, a view's
     own whatever its group. Optional, for those who want it (`GeneratorSpec.wants`): images (M, 3, H, W) float32 in
-    [0, 1] of the given views; scene: the cameras of all captured views; hints: maps (N, ..., H, W) by name of what is
-    known of the targets beforehand, such as the colours that a plane sweep of the given views finds; planned: the
-    cameras of all planned views of the same sample set.
+    [0, 1] of the given views; scene: the cameras of all captured views; hints: maps by name of what is known of the
+    targets beforehand, as a plane sweep of photos finds it: colour (N, 3, H, W) in [0, 1], and (N, H, W) confidence,
+    inverse_depth, spread, seen (`cat3d_core.matching.hint.Hint`), or empty; planned: the cameras of all planned views
+    of the same sample set.
     """
 
     latents: Tensor

@@ -51,6 +51,8 @@ class Reconstructor(Protocol):
     #: Everything that can change the result, as JSON values: part of the stage's content key, and stored beside the
     #: tensors.
     settings: Mapping[str, Any]
+    # One that has `view_pixels: int` says by it how many pixels of a view its training can fill; photos that have far
+    # more are made smaller before (docs/guides/own_reconstructor.md).
 
     @classmethod
     def from_request(cls, request: ReconstructionRequest) -> Self:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,8 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from cat3d_core.cameras import Cameras
-
-Maps = Sequence[Tensor | None] | None
+from cat3d_core.reconstruction.buffers import Maps, flat_maps, flat_shares, pixel_buffer
 
 
 @dataclass(frozen=True)
@@ -37,35 +36,25 @@ class Views:
 
     @classmethod
     def from_images(
-        cls, cameras: Cameras, images: Sequence[Tensor], captured: Tensor, masks: Maps = None, *,
+        cls, cameras: Cameras, images: Iterable[Tensor], captured: Tensor, masks: Maps = None, *,
         weights: Maps = None, depths: Maps = None, depth_weights: Maps = None,
     ) -> Views:  # fmt: skip
-        """images: N uint8 tensors (H, W, 3), sRGB; captured (N,) bool. Maps (H, W) of each view, None for none, also
-        for a single view: masks bool, False where a pixel must not count; weights in [0, 1] of the colours (such as the
-        confidence of generated ones; 0: the pixel does not count); depths, z-depth in scene units (infinite: the sky; 0
-        or NaN: unknown), with depth_weights in [0, 1] (1 by default).
+        """images: N uint8 tensors (H, W, 3), sRGB, taken one at a time, so that they need not be in memory together;
+        captured (N,) bool. Maps (H, W) of each view, None for none, also for a single view: masks bool, False where a
+        pixel must not count; weights in [0, 1] of the colours (such as the confidence of generated ones; 0: the pixel
+        does not count); depths, z-depth in scene units (infinite: the sky; 0 or NaN: unknown), with depth_weights in
+        [0, 1] (1 by default).
 
         Raises ValueError, naming the view, where a shape, a dtype or a value does not fit.
         """
-        if not len(images) == len(cameras) == len(captured) or not len(images):
-            raise ValueError(
-                f"Reconstruction needs at least one view and as many images ({len(images)}) and captured flags "
-                f"({len(captured)}) as cameras ({len(cameras)})."
-            )
-        for index, image in enumerate(images):
-            width, height = cameras.size[index].tolist()
-            if image.dtype != torch.uint8 or tuple(image.shape) != (height, width, 3):
-                raise ValueError(
-                    f"The image of view {index} is {image.dtype} {tuple(image.shape)}; its camera needs uint8 "
-                    f"{(height, width, 3)}."
-                )
-        shapes = [image.shape[:2] for image in images]
-        mask = _flat("mask", masks, shapes, 1.0)
-        weight = _shares("weight", weights, shapes)
+        pixels = pixel_buffer(cameras, images, len(captured))
+        shapes = [torch.Size((height, width)) for width, height in cameras.size.tolist()]
+        valid = flat_maps("mask", masks, shapes, True, torch.bool)
+        weight = flat_shares("weight", weights, shapes)
         if weight is not None:
-            mask = weight if mask is None else mask * weight
-        depth = _flat("depth", depths, shapes, torch.nan)
-        depth_weight = _shares("depth weight", depth_weights, shapes)
+            valid = weight != 0 if valid is None else valid & (weight != 0)
+        depth = flat_maps("depth", depths, shapes, torch.nan)
+        depth_weight = flat_shares("depth weight", depth_weights, shapes)
         inverse = None
         if depth is not None:
             known = depth > 0
@@ -74,8 +63,8 @@ class Views:
         return cls(
             cameras.to(dtype=torch.float32),
             captured.to(torch.bool),
-            torch.cat([image.reshape(-1, 3) for image in images]),
-            None if mask is None else mask != 0,
+            pixels,
+            valid,
             weight,
             inverse,
             depth_weight if depth is not None else None,
@@ -99,20 +88,36 @@ class Views:
     def counting(self) -> Tensor:
         """(N,) how many pixels of each view count."""
         pixels = self.size.prod(-1)
-        if self.valid is None:
-            return pixels
-        ends = self.valid.cumsum(0)[self.offset + pixels - 1]
-        return ends.diff(prepend=ends.new_zeros(1))
-
-    @cached_property
-    def _places(self) -> Tensor | None:
-        """Where the pixels that count are, None for everywhere."""
-        return None if self.valid is None else self.valid.nonzero()[:, 0]
+        return pixels if self.valid is None else self._before(self.offset + pixels) - self._begins
 
     @cached_property
     def _begins(self) -> Tensor:
         """(N,) how many pixels that count lie before each view."""
-        return self.counting.cumsum(0) - self.counting
+        return self._before(self.offset)
+
+    @cached_property
+    def _blocks(self) -> Tensor:
+        """How many pixels that count lie before each block of _BLOCK pixels, and in all: places of single pixels would
+        take eight bytes for each."""
+        assert self.valid is not None
+        whole = len(self.valid) // _BLOCK * _BLOCK
+        # In parts: to be summed, truth values are turned into integers of eight bytes.
+        counts = [part.view(-1, _BLOCK).sum(1) for part in self.valid[:whole].split(_BLOCK << 18)]
+        return torch.cat([self.offset.new_zeros(1), *counts, self.valid[whole:].sum()[None]]).cumsum(0)
+
+    def _block(self, block: Tensor) -> Tensor:
+        """(R, _BLOCK) bool: which pixels of blocks (R,) count."""
+        assert self.valid is not None
+        index = block[:, None] * _BLOCK + torch.arange(_BLOCK, device=block.device)
+        return self.valid[index.clamp(max=len(self.valid) - 1)] & (index < len(self.valid))
+
+    def _before(self, index: Tensor) -> Tensor:
+        """How many pixels that count lie before these places (R,) in `pixels`."""
+        if self.valid is None:
+            return index
+        block, within = index // _BLOCK, index % _BLOCK
+        earlier = torch.arange(_BLOCK, device=index.device) < within[:, None]
+        return self._blocks[block] + (self._block(block) & earlier).sum(1)
 
     def to(self, device: torch.device | str) -> Views:
         """These views with their tensors on a device."""
@@ -165,8 +170,11 @@ class Views:
     def pixel(self, view: Tensor, number: Tensor) -> Tensor:
         """Integer pixels xy (R, 2): of those of views (R,) that count, row by row, the ones with these numbers (R,)."""
         index = self._begins[view] + number
-        if self._places is not None:
-            index = self._places[index]
+        if self.valid is not None:
+            block = torch.searchsorted(self._blocks, index, right=True) - 1
+            inside = self._block(block).cumsum(1, dtype=torch.uint8)
+            left = index - self._blocks[block]
+            index = block * _BLOCK + (inside > left[:, None]).to(torch.uint8).argmax(1)
         index, width = index - self.offset[view], self.size[view, 0]
         return torch.stack([index % width, index // width], -1)
 
@@ -185,6 +193,8 @@ class Views:
         return Batch(view, xy, rgb, valid, weight, depth, depth_weight, patch)
 
 
+#: Pixels that are counted together, so that the one with a given number is found by looking at one block.
+_BLOCK = 32
 #: The fields of Views that every pixel has a value of.
 _MAPS = ("pixels", "valid", "weight", "inverse_depth", "inverse_depth_weight")
 
@@ -193,31 +203,6 @@ def _halved(values: Tensor) -> Tensor:
     """Means (h, w, ...) float32 of squares of two pixels' side of (H, W, ...)."""
     planes = values.float().reshape(*values.shape[:2], -1).permute(2, 0, 1)
     return functional.avg_pool2d(planes, 2).permute(1, 2, 0).reshape(-1, values.shape[1] // 2, *values.shape[2:])
-
-
-def _flat(what: str, maps: Maps, shapes: Sequence[torch.Size], missing: float) -> Tensor | None:
-    """(P,) float32: the maps of all views one after another, `missing` for views without one; None without any."""
-    if maps is None:
-        return None
-    if len(maps) != len(shapes):
-        raise ValueError(f"There are {len(maps)} {what}s for {len(shapes)} images.")
-    for index, (values, shape) in enumerate(zip(maps, shapes, strict=True)):
-        if values is not None and values.shape != shape:
-            raise ValueError(
-                f"The {what} of view {index} has shape {tuple(values.shape)}; its image is {tuple(shape)}."
-            )
-    whole = (torch.full(shape, missing) if m is None else m.float() for m, shape in zip(maps, shapes, strict=True))
-    return torch.cat([values.reshape(-1) for values in whole])
-
-
-def _shares(what: str, maps: Maps, shapes: Sequence[torch.Size]) -> Tensor | None:
-    """`_flat` of values that lie in [0, 1]."""
-    flat = _flat(what, maps, shapes, 1.0)
-    if flat is not None:
-        for index, part in enumerate(flat.split([shape.numel() for shape in shapes])):
-            if not bool(((part >= 0) & (part <= 1)).all()):
-                raise ValueError(f"The {what} of view {index} has values outside [0, 1] (or NaN).")
-    return flat
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from torch import Tensor
 from cat3d_core.cameras import Cameras
 from cat3d_core.diffusion.guidance import GuidanceConfig
 from cat3d_core.diffusion.memory import Need
-from cat3d_core.diffusion.sampler import SamplerConfig
+from cat3d_core.diffusion.sampler import SamplerConfig, evaluations
 from cat3d_core.generation.memory import Memory
 from cat3d_core.generation.protocol import Cost, GeneratorSpec, ViewGroup
 from cat3d_core.seva.cameras import rays, scene_scale
@@ -66,8 +66,7 @@ def _at(
 
 
 def _cost(config: SevaConfig, given: int, targets: int, sampler: SamplerConfig) -> Cost:
-    levels = SevaSchedule().nodes(sampler.nodes, sampler.steps).tolist()
-    count = sum(2 if sampler.guidance.active(level) else 1 for level in levels)
+    count = evaluations(sampler, SevaSchedule())
     return Cost(count, count * _flops(config, max(given + targets, config.views)))
 
 

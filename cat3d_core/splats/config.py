@@ -72,8 +72,8 @@ class SplatConfig:
     """MCMC: every time, 5 % more Gaussians, up to `most`."""
     density_every: int = 10
     density_until: float = 0.8
-    """MCMC moves dead Gaussians and adds new ones every 100 steps of 30,000; here of a few hundred. Then it stops, so
-    that they settle."""
+    """MCMC moves dead Gaussians and adds new ones every 100 of 30,000 steps; here there are a few hundred steps. After
+    this share of the training it stops, so that they settle."""
     dead_opacity: float = 0.005
     noise: float = 0.1
     """Standard deviation of a step's noise in units of the Gaussian's own; it falls with the learning rate and with the

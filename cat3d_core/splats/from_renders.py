@@ -10,9 +10,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from cat3d_core.cameras import Cameras
+from cat3d_core.quaternions import quaternions_from_rotations
 from cat3d_core.rays import image_rays
 from cat3d_core.reconstruction.render import Render
-from cat3d_core.splats.gaussians import Gaussians, harmonics_of_colour, quaternions_from_rotations
+from cat3d_core.splats.gaussians import Gaussians, harmonics_of_colour
 
 WIDTH = 0.4
 """Standard deviation within the surface, in pixel widths. More closes gaps and blurs: 0.3, 0.4, 0.6 and 0.9 gave 22.6,

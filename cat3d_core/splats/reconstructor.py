@@ -15,6 +15,7 @@ from cat3d_core.metrics.perceptual import perceptual_name
 from cat3d_core.reconstruction.perceptual import perceptual_loss
 from cat3d_core.reconstruction.protocol import ReconstructionRequest, Reconstructor
 from cat3d_core.reconstruction.render import Render
+from cat3d_core.reconstruction.trained import Trained
 from cat3d_core.reconstruction.views import Views
 from cat3d_core.splats import rasterize_cpu, rasterize_gsplat
 from cat3d_core.splats.config import PRESETS, SplatConfig
@@ -22,8 +23,10 @@ from cat3d_core.splats.gaussians import Gaussians
 from cat3d_core.splats.rasterize import render
 from cat3d_core.splats.trainer import SplatTrainer, splats_of_state
 
+GAUSSIAN_PIXELS = 10
 
-class Splats:
+
+class Splats(Trained[SplatTrainer]):
     """3D Gaussian splatting with MCMC densification, see `Reconstructor`."""
 
     presets: ClassVar[tuple[str, ...]] = tuple(PRESETS)
@@ -36,7 +39,6 @@ class Splats:
     ) -> None:
         """Use `from_request` or `from_tensors`."""
         self.settings, self._request, self._gaussians = settings, request, gaussians
-        self._trainer: SplatTrainer | None = None
 
     @classmethod
     def from_request(cls, request: ReconstructionRequest) -> Self:
@@ -55,17 +57,14 @@ class Splats:
         return cls.from_tensors(settings, splats_of_state(state), device)
 
     @property
-    def trainer(self) -> SplatTrainer:
-        """The training under way. Raises ValueError before `start`."""
-        if self._trainer is None:
-            raise ValueError("This reconstruction has not been started.")
-        return self._trainer
+    def view_pixels(self) -> int:
+        """A Gaussian covers about GAUSSIAN_PIXELS of a view."""
+        return GAUSSIAN_PIXELS * _config(self.settings["splats"]).most
 
     @property
     def gaussians(self) -> Gaussians:
         """The Gaussians as they are now, without gradient."""
-        found = self._gaussians if self._gaussians is not None else self.trainer.gaussians
-        return Gaussians(**{name: value.detach() for name, value in found.tensors().items()})
+        return (self._gaussians if self._gaussians is not None else self.trainer.gaussians).detach()
 
     def start(self, views: Views, seed: int, device: torch.device | str) -> list[Decision]:
         if self._request is None:
@@ -81,27 +80,6 @@ class Splats:
         perceptual, warnings = perceptual_loss(config.lpips_weight, config.patch_size)
         self._trainer = SplatTrainer(config, views, seed, device, perceptual)
         return decisions + warnings
-
-    @property
-    def iteration(self) -> int:
-        return self.trainer.iteration
-
-    @property
-    def iterations(self) -> int:
-        return self.trainer.config.iterations
-
-    @property
-    def finished(self) -> bool:
-        return self.trainer.finished
-
-    def step(self) -> dict[str, float]:
-        return self.trainer.step()
-
-    def state(self) -> dict[str, Tensor]:
-        return self.trainer.state()
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        self.trainer.load_state(state)
 
     def decisions(self) -> list[Decision]:
         trainer, out = self.trainer, []

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.splats.gaussians import rotation_matrices
+from cat3d_core.quaternions import rotation_matrices
 
 NEAR = 0.01
 """Gaussians whose means are nearer (z-depth, scene units) are not drawn: the linearised projection ends there."""
@@ -52,14 +52,13 @@ class Raster(NamedTuple):
 
 
 class Projected(NamedTuple):
-    """centre (N, 2) in pixels; conic (N, 3): a, b, c of 1/2 (a dx^2 + c dy^2) + b dx dy; opacity (N,); depth (N,); the
-    images' covariances xx and yy (N, 2), from which how far they reach follows."""
+    """centre (N, 2) in pixels; conic (N, 3): a, b, c of 1/2 (a dx^2 + c dy^2) + b dx dy; opacity (N,); depth
+    (N,)."""
 
     centre: Tensor
     conic: Tensor
     opacity: Tensor
     depth: Tensor
-    variance: Tensor
 
 
 def whole(camera: Cameras) -> Window:
@@ -95,7 +94,7 @@ def project(
     centre = torch.stack([fx * ratio[:, 0] + skew * ratio[:, 1], fy * ratio[:, 1]], -1) + k[:2, 2]
     if antialias:
         opacities = opacities * (sharp / determinant).clamp_min(LEAST_RATIO).sqrt()
-    return Projected(centre, conic, opacities, depth, torch.stack([xx, yy], -1) + BLUR)
+    return Projected(centre, conic, opacities, depth)
 
 
 def rasterize(
@@ -109,8 +108,7 @@ def rasterize(
     antialias: bool = True,
 ) -> Raster:
     """The images of N Gaussians with features (N, C), put over one another, nearest first, over nothing (0)."""
-    raster, _ = rasterize_with_margin(means, quaternions, scales, opacities, features, camera, window, antialias)
-    return raster
+    return _composited(means, quaternions, scales, opacities, features, camera, window, antialias)[0]
 
 
 def rasterize_with_margin(
@@ -125,19 +123,40 @@ def rasterize_with_margin(
 ) -> tuple[Raster, Tensor]:
     """`rasterize`, and (H, W) the relative distance of each pixel to its nearest cut (LEAST_ALPHA, LEAST_LIGHT, half of
     the light, equal depths), where rounding decides and the result jumps."""
+    raster, raw, light, depth = _composited(means, quaternions, scales, opacities, features, camera, window, antialias)
+    with torch.no_grad():
+        ones = raw.new_ones((len(raw), 1))
+        margins = [ones, (raw / LEAST_ALPHA - 1).abs()]
+        margins += [(light / cut - 1).abs() for cut in (LEAST_LIGHT, 0.5)]
+        gap = depth.diff().abs() / depth[1:] if len(depth) > 1 else depth.new_ones(1)
+        margin = torch.cat(margins, 1).amin(1).minimum(gap.amin())
+    return raster, margin.view(raster.opacity.shape)
+
+
+def _composited(
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    camera: Cameras,
+    window: Window | None,
+    antialias: bool,
+) -> tuple[Raster, Tensor, Tensor, Tensor]:
+    """The images; alphas before they are cut and the light left behind each Gaussian (pixels, N), nearest first; the
+    Gaussians' depths (N,)."""
     x0, y0, width, height = window or whole(camera)
     flat = project(means, quaternions, scales, opacities, camera, antialias)
     shown = flat.depth.detach() > NEAR
     order = flat.depth.detach().argsort(stable=True)
     order = order[shown[order]]
-    centre, conic, opacity, depth = (value[order] for value in flat[:4])
+    centre, conic, opacity, depth = (value[order] for value in flat)
     y, x = torch.meshgrid(torch.arange(height) + 0.5 + y0, torch.arange(width) + 0.5 + x0, indexing="ij")
     pixel = torch.stack([x, y], -1).reshape(-1, 1, 2).to(means)
     dx, dy = (pixel - centre).unbind(-1)
     a, b, c = conic.unbind(-1)
-    alpha = opacity * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-    drawn = alpha >= LEAST_ALPHA
-    alpha = torch.where(drawn, alpha.clamp_max(MOST_ALPHA), 0.0)  # (pixels, N)
+    raw = opacity * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+    alpha = torch.where(raw >= LEAST_ALPHA, raw.clamp_max(MOST_ALPHA), 0.0)  # (pixels, N)
     light = (1 - alpha).cumprod(1)
     reached = light >= LEAST_LIGHT
     before = torch.cat([torch.ones_like(light[:, :1]), light[:, :-1]], 1)
@@ -150,11 +169,4 @@ def rasterize_with_margin(
         (weight @ features[order]).T.reshape(-1, *shape),
         (weight @ depth).view(shape), weight.sum(1).view(shape), median.view(shape),
     )  # fmt: skip
-    with torch.no_grad():
-        raw = opacity * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-        ones = raw.new_ones((len(raw), 1))
-        margins = [ones, (raw / LEAST_ALPHA - 1).abs()]
-        margins += [(light / cut - 1).abs() for cut in (LEAST_LIGHT, 0.5)]
-        gap = depth.diff().abs() / depth[1:] if len(depth) > 1 else depth.new_ones(1)
-        margin = torch.cat(margins, 1).amin(1).minimum(gap.amin())
-    return raster, margin.view(shape)
+    return raster, raw, light, depth

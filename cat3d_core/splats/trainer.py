@@ -130,12 +130,12 @@ class SplatTrainer:
         result = {name: float(value) for name, value in totals.items()}
         mse = result.pop("mse")
         psnr = -10.0 * math.log10(mse) if 0.0 < mse < math.inf else math.nan
-        numbers = {"lr": rates["means"], "gaussians": float(len(self.parameters["logits"])), "rays": rays}
         return {
             **result,
             "loss": sum(result.values()),
             "psnr": psnr,
-            **numbers,
+            "lr": rates["means"],
+            "gaussians": float(len(self.parameters["logits"])),
             "rays": rays,
             "skipped": float(self.skipped),
         }
@@ -266,4 +266,4 @@ def train(trainer: SplatTrainer) -> Gaussians:
     """Run the training to its end."""
     while not trainer.finished:
         trainer.step()
-    return Gaussians(**{name: value.detach() for name, value in trainer.gaussians.tensors().items()})
+    return trainer.gaussians.detach()

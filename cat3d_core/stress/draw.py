@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from cat3d_core.quaternions import rotation_matrices
+
 # Shares of special values among drawn magnitudes.
 _ZEROS, _DENORMALS, _ONES = 0.04, 0.03, 0.05
 
@@ -82,7 +84,7 @@ class Draw:
         kind = self.unit(n)
         first = torch.eye(4, dtype=torch.float64)
         q = torch.where((kind < 0.03)[..., None], first[0], torch.where((kind > 0.97)[..., None], first[2], q))
-        return rotation_from_quaternion(q)
+        return rotation_matrices(q)
 
     def edges(self, n: int, low: float = 0.0, high: float = 1.0, ties: bool = True) -> Tensor:
         """(count, n) sorted numbers from low to high, both included; some equal, some very close together."""
@@ -101,14 +103,3 @@ class Draw:
         """(count, 1) one of the values."""
         table = torch.tensor(values, dtype=torch.float64)
         return table[(self.unit(1) * len(values)).long()]
-
-
-def rotation_from_quaternion(q: Tensor) -> Tensor:
-    """(..., 4) quaternions w, x, y, z of any length -> (..., 3, 3) rotations."""
-    w, x, y, z = (q / q.norm(dim=-1, keepdim=True)).unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))

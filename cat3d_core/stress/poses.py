@@ -9,8 +9,9 @@ from torch import Tensor
 
 from cat3d_core.alignment import rotation_angle_deg, umeyama
 from cat3d_core.normalization import Similarity, normalize_scene
+from cat3d_core.quaternions import rotation_matrices
 from cat3d_core.splines import rotation_spline, so3_exp, so3_log, vector_spline
-from cat3d_core.stress.draw import Draw, rotation_from_quaternion
+from cat3d_core.stress.draw import Draw
 from cat3d_core.stress.geometry import cameras_of, length, pose_of
 from cat3d_core.stress.routine import DOUBLE, ROUNDING, SINGLE, Exact, Routine, each, zero
 from cat3d_core.view_selection import pose_distance
@@ -89,7 +90,7 @@ def _rotation(w: Tensor) -> Tensor:
     """Rotation vectors (..., 3) -> rotations (..., 3, 3) by way of the quaternion."""
     half = (length(w) / 2)[..., None]
     axis = w / torch.where(half > 0, 2 * half, 1.0)
-    return rotation_from_quaternion(torch.cat([half.cos(), half.sin() * axis], -1))
+    return rotation_matrices(torch.cat([half.cos(), half.sin() * axis], -1))
 
 
 def _so3_exp_reference(w: Tensor) -> Exact:

@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
+from cat3d_core.quaternions import rotation_matrices
 from cat3d_core.splats import rasterize_cpu, reference
 from cat3d_core.splats.density import split
 from cat3d_core.splats.trainer import expand
-from cat3d_core.stress.draw import Draw, rotation_from_quaternion
+from cat3d_core.stress.draw import Draw
 from cat3d_core.stress.routine import DOUBLE, ROUNDING, SINGLE, Exact, Routine, each, zero
 
 _SIDE = 12
@@ -56,7 +57,7 @@ def _project_exact(means: Tensor, quaternions: Tensor, scales: Tensor, opacities
     v = (means[..., 1] / means[..., 2]).clamp(-most, most)
     one, nil = torch.ones_like(u), torch.zeros_like(u)
     slope = torch.stack([one, nil, -u, nil, one, -v], -1).unflatten(-1, (2, 3)) / means[..., 2, None, None]
-    image = k[:2, :2] @ slope @ rotation_from_quaternion(quaternions) @ torch.diag_embed(scales)
+    image = k[:2, :2] @ slope @ rotation_matrices(quaternions) @ torch.diag_embed(scales)
     covariance = image @ image.mT + reference.BLUR * torch.eye(2, dtype=DOUBLE)
     xx, xy, yy = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
     determinant = xx * yy - xy * xy

@@ -14,6 +14,7 @@ from cat3d_core.metrics.perceptual import perceptual_name
 from cat3d_core.reconstruction.perceptual import perceptual_loss
 from cat3d_core.reconstruction.protocol import ReconstructionRequest, Reconstructor
 from cat3d_core.reconstruction.render import Render
+from cat3d_core.reconstruction.trained import Trained
 from cat3d_core.reconstruction.views import Views
 from cat3d_core.zipnerf.config import PRESETS
 from cat3d_core.zipnerf.field import Field
@@ -21,8 +22,11 @@ from cat3d_core.zipnerf.render import render_image, render_uncertainty
 from cat3d_core.zipnerf.settings import chosen_config, config_document, config_from_document, fitted, rules
 from cat3d_core.zipnerf.trainer import Trainer
 
+#: About so many photos show the whole scene once.
+PASSED = 8
 
-class ZipNerf:
+
+class ZipNerf(Trained[Trainer]):
     """Robust Zip-NeRF (CAT3D sec. 'Robust 3D reconstruction'), see `Reconstructor`."""
 
     presets: ClassVar[tuple[str, ...]] = tuple(PRESETS)
@@ -32,7 +36,6 @@ class ZipNerf:
     ) -> None:
         """Use `from_request` or `from_tensors`."""
         self.settings, self._request, self._field = settings, request, field
-        self._trainer: Trainer | None = None
 
     @classmethod
     def from_request(cls, request: ReconstructionRequest) -> Self:
@@ -53,11 +56,10 @@ class ZipNerf:
         return cls.from_tensors(settings, own, device)
 
     @property
-    def trainer(self) -> Trainer:
-        """The training under way. Raises ValueError before `start`."""
-        if self._trainer is None:
-            raise ValueError("This reconstruction has not been started.")
-        return self._trainer
+    def view_pixels(self) -> int:
+        """So many that the training sees each pixel of PASSED views once: what is more stays blurred."""
+        config = config_from_document(self.settings["trainer"])
+        return config.iterations * config.batch_rays // PASSED
 
     @property
     def field(self) -> Field:
@@ -73,26 +75,8 @@ class ZipNerf:
         self._trainer = Trainer(config, views, seed, device, perceptual)
         return decisions + warnings
 
-    @property
-    def iteration(self) -> int:
-        return self.trainer.iteration
-
-    @property
-    def iterations(self) -> int:
-        return self.trainer.config.iterations
-
-    @property
-    def finished(self) -> bool:
-        return self.trainer.finished
-
     def step(self) -> dict[str, float]:
-        return self.trainer.step() | {"rays": float(self.trainer.config.batch_rays)}
-
-    def state(self) -> dict[str, Tensor]:
-        return self.trainer.state()
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        self.trainer.load_state(state)
+        return super().step() | {"rays": float(self.trainer.config.batch_rays)}
 
     def decisions(self) -> list[Decision]:
         return _skipped(self.trainer)

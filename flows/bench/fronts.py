@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from flows.bench.registry import Panel, Row
+from flows.bench.registry import Panel
+from flows.bench.rows import Row
 from flows.bench.sampler import front as lowest_front
 
 

@@ -10,7 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from flows.bench.fronts import Drawn, cell, drawn_panels, verdict
-from flows.bench.registry import BENCHES, Row
+from flows.bench.registry import BENCHES
+from flows.bench.rows import Row
 from schemas.errors import StoreError
 
 #: Columns that say where and when rows were measured; each benchmark has one value of them.

@@ -7,7 +7,7 @@ benchmark set a cost against an error or a quality: the front is worth choosing 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,18 +20,14 @@ from cat3d_core.metrics.perceptual import find_perceptual
 from cat3d_core.weights import default_model_path
 from cat3d_core.zipnerf import PRESETS
 from flows.bench import cameras, metrics, plan, poses, reconstruct, sampler, scenes, skips, splats, store, synthetic
-from flows.errors import InputError
+from flows.bench.peers import compare
+from flows.bench.rows import MissingError, Row, marked, scenes_of
+from flows.bench.size import size_rows
 from flows.generation.formats import cat3d
 from flows.media.images import read_image
 from flows.readers import read_capture
 from flows.training import evaluation
 from schemas.config import PosesConfig, ReconstructConfig, SampleConfig
-
-Row = dict[str, Any]
-
-
-class MissingError(InputError):
-    """A benchmark lacks what it works on: data or a model that is not on this machine."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +58,6 @@ class Bench:
     panels: tuple[Panel, ...] = ()
 
 
-def _marked(rows: list[Row], default: Mapping[str, Any]) -> list[Row]:
-    return [row | {"default": all(row.get(name) == value for name, value in default.items())} for row in rows]
-
-
 def _devices() -> list[str]:
     return ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
@@ -75,16 +67,6 @@ def _model_file() -> Path:
         return default_model_path()
     except FileNotFoundError as error:
         raise MissingError(str(error)) from None
-
-
-def _scenes(data: Path | None, names: list[str]) -> list[Path]:
-    """Those of the named scenes that are in the folder of real scenes."""
-    if data is None:
-        raise MissingError("This benchmark works on real scenes with known cameras: give their folder as --data DIR.")
-    found = [data / name for name in names if (data / name).is_dir()]
-    if not found:
-        raise MissingError(f"{data} holds none of the scenes {', '.join(names)}.")
-    return found
 
 
 def sampler_rows(quick: bool, data: Path | None) -> list[Row]:
@@ -97,7 +79,7 @@ def sampler_rows(quick: bool, data: Path | None) -> list[Row]:
             rows += sampler.rows(_model_file(), steps)
     bounds = MEASURED.guidance.low_log_snr, MEASURED.guidance.high_log_snr
     interval = next(name for name, found in sampler.INTERVALS.items() if found == bounds)
-    return _marked(rows, chosen | {"interval": interval, "problem": "mixture"})  # a model's file has its own default
+    return marked(rows, chosen | {"interval": interval, "problem": "mixture"})  # a model's file has its own default
 
 
 def reconstruct_rows(quick: bool, data: Path | None) -> list[Row]:
@@ -116,7 +98,7 @@ def reconstruct_rows(quick: bool, data: Path | None) -> list[Row]:
                 vary = tuple(reconstruct.VARIATIONS) if preset == default else ()
                 rows += reconstruct.curves(preset, ("mip360",), vary, device=device)
     whole = float(PRESETS[default].iterations)
-    return _marked(rows, {"preset": default, "varied": "preset", "iterations": whole})
+    return marked(rows, {"preset": default, "varied": "preset", "iterations": whole})
 
 
 def scene_rows(quick: bool, data: Path | None) -> list[Row]:
@@ -125,7 +107,7 @@ def scene_rows(quick: bool, data: Path | None) -> list[Row]:
     config = replace(PRESETS[default], lpips_weight=0.0)
     if quick:
         config = replace(config, iterations=config.iterations // 10, warmup_iterations=config.warmup_iterations // 10)
-    found = _scenes(data, ["llff_fern"] if quick else list(scenes.DOWNSCALE))
+    found = scenes_of(data, ["llff_fern"] if quick else list(scenes.DOWNSCALE))
     return [{"preset": default} | scenes.row(scene, "all", config, scenes.DOWNSCALE[scene.name]) for scene in found]
 
 
@@ -133,7 +115,7 @@ def geometry_rows(quick: bool, data: Path | None) -> list[Row]:
     from flows.bench import geometry  # Open3D, which nothing else here needs
 
     rows = [row for device in _devices() for row in geometry.rows(quick, device)]
-    return _marked(rows, {"preset": ReconstructConfig().preset})
+    return marked(rows, {"preset": ReconstructConfig().preset})
 
 
 def kernel_rows(quick: bool, data: Path | None) -> list[Row]:
@@ -147,9 +129,9 @@ def kernel_rows(quick: bool, data: Path | None) -> list[Row]:
 def pose_rows(quick: bool, data: Path | None) -> list[Row]:
     default = PosesConfig().max_features
     features = sorted({1000, default} if quick else {1000, 2000, 4000, 8000, default})
-    scenes = _scenes(data, ["strecha_fountain_P11"] if quick else list(poses.SCENES))
+    scenes = scenes_of(data, ["strecha_fountain_P11"] if quick else list(poses.SCENES))
     rows = [poses.measure(scene, poses.SCENES[scene.name], count) for scene in scenes for count in features]
-    return _marked(rows, {"features": default})
+    return marked(rows, {"features": default})
 
 
 def camera_rows(quick: bool, data: Path | None) -> list[Row]:
@@ -157,13 +139,13 @@ def camera_rows(quick: bool, data: Path | None) -> list[Row]:
     sources: list[str | Path] = list(cameras.PROCEDURAL)
     if data is not None:
         known = [*poses.SCENES, "dtu_scan37", "re10k_bedroom", "mipnerf360_bonsai", "nerf_synthetic_lego"]
-        sources = list(_scenes(data, known[:1] if quick else known))
+        sources = list(scenes_of(data, known[:1] if quick else known))
     return cameras.rows(sources[:1] if quick else sources, trials=15 if quick else 105)
 
 
 def metric_rows(quick: bool, data: Path | None) -> list[Row]:
     rows = metrics.rows(2, 252, 336, 3) if quick else metrics.rows()
-    return _marked(rows, {"implementation": "cat3d"})
+    return marked(rows, {"implementation": "cat3d"})
 
 
 def plan_rows(quick: bool, data: Path | None) -> list[Row]:
@@ -175,7 +157,7 @@ def store_rows(quick: bool, data: Path | None) -> list[Row]:
     views, size, repeats = (4, 256, 3) if quick else (8, 512, 5)
     rows = store.rows(views, size, repeats)
     if data is not None:
-        scene = _scenes(data, list(poses.SCENES))[0]
+        scene = scenes_of(data, list(poses.SCENES))[0]
         paths = read_capture(scene).paths[:views]
         photos = [read_image(path)[0] for path in paths]
         rows += store.photo_rows(photos, scene.name, size, repeats)
@@ -207,7 +189,7 @@ def skip_rows(quick: bool, data: Path | None) -> list[Row]:
             alone = [(f"{family}, each alone", *scene[1:]) for scene in scenes if f":{family}/" in scene[1]]
             variants = ("none", *(f"only {name}" for name in switches), "default", "all")
             rows += skips.rows(alone, variants, skips.SHORT_BASE, skips.FOLDER / "alone")
-    return _marked(rows, {"variant": "default"})
+    return marked(rows, {"variant": "default"})
 
 
 def synthetic_rows(quick: bool, data: Path | None) -> list[Row]:
@@ -215,12 +197,17 @@ def synthetic_rows(quick: bool, data: Path | None) -> list[Row]:
 
 
 def splat_rows(quick: bool, data: Path | None) -> list[Row]:
-    """The rasteriser's speed, splats of fields, and both reconstructors on few views."""
+    """The rasteriser's speed, splats of fields (with `data` of captured scenes too), both reconstructors on few
+    views."""
     if quick:
         families = ("co3d",)
-        rows = splats.kernel_rows(1, (1,)) + splats.conversion_rows(families, size=32, steps=60)
+        rows = splats.kernel_rows(1, (1,))
+        rows += splats.conversion_rows(splats.procedural_scenes(families, 32), steps=60)
         return rows + splats.method_rows(families, (3,), (0,), (("splats", "tiny"),), size=32)
-    return splats.kernel_rows() + splats.conversion_rows() + splats.method_rows()
+    rows = splats.kernel_rows() + splats.conversion_rows(splats.procedural_scenes())
+    if data is not None:
+        rows += splats.conversion_rows(splats.captured_scenes(scenes_of(data, list(scenes.DOWNSCALE))))
+    return rows + splats.method_rows()
 
 
 _SAMPLER_POINT = {"series": ("solver", "nodes"), "label": ("steps", "dtype"), "each": ("interval",)}
@@ -286,6 +273,23 @@ BENCHES: dict[str, Bench] = {
         splat_rows,
         (Panel("Reconstructors", "cpu_s", "psnr", ("method",), ("preset", "seed"), ("family", "views"),
                higher_is_better=True),),
+    ),
+    "peers": Bench(
+        "other programs beside ours on one task each: reconstruction, poses, metrics, sampler, network, store",
+        compare.rows,
+        (
+            Panel("Reconstruction beside nerfacto", "seconds", "psnr_db", ("who", "setting"), ("step",),
+                  ("scene", "views"), where=(("part", "reconstruction"),), higher_is_better=True),
+            Panel("Samplers", "steps", "error", ("who", "setting"), where=(("part", "sampler"),)),
+        ),
+    ),
+    "size": Bench(
+        "seconds and peak memory of a whole run by the number and size of the photos, as phones make them",
+        size_rows,
+        (
+            Panel("Seconds by the number of photos", "photos", "cpu_seconds", ("megapixels",)),
+            Panel("Memory by the number of photos", "photos", "peak_gb", ("megapixels",)),
+        ),
     ),
     "synthetic": Bench("procedural scenes rendered: views a second per family", synthetic_rows),
 }  # fmt: skip

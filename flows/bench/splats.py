@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from cat3d_core.splats import Gaussians, rasterize_cpu, reference, render
 from cat3d_core.splats.viewpoints import between
 from cat3d_core.synthetic.families import FAMILIES
 from flows.bench.reconstruct import procedural_views
+from flows.bench.scenes import DOWNSCALE, scene_views
 from flows.exports.splats import splats_of, write_splats
 from flows.progress import meter
 from flows.reconstruction.open import reconstructor_class
@@ -78,35 +79,44 @@ def _pass(draw: Any, count: int, side: int, repeats: int) -> tuple[float, float]
     return best[0], best[1]
 
 
-def conversion_rows(
-    families: Sequence[str] = tuple(FAMILIES),
-    train: int = 24,
-    test: int = 4,
-    size: int = 64,
-    steps: int = 500,
-    most_views: int = 72,
-) -> list[dict[str, Any]]:
-    """Splats against the field (preset fast) that they were made of, on held-out views, without and with refinement."""
+Named = tuple[str, Views, Views]  # a scene's name, training and held-out views
+
+
+def procedural_scenes(families: Sequence[str] = tuple(FAMILIES), size: int = 64) -> Iterator[Named]:
+    """24 training and 4 held-out views of each family."""
+    for family in families:
+        yield family, *procedural_views(family, 24, 4, size, size)[:2]
+
+
+def captured_scenes(folders: Sequence[Path]) -> Iterator[Named]:
+    """All training and held-out views of captured scenes, about 100 pixels large."""
+    for folder in folders:
+        yield folder.name, *scene_views(folder, "all", DOWNSCALE[folder.name])
+
+
+def conversion_rows(scenes: Iterable[Named], steps: int = 500, most_views: int = 72) -> list[dict[str, Any]]:
+    """Splats against the field (preset fast) that they were made of, on held-out views, without and with refinement;
+    seconds are those of one processor core."""
     rows = []
-    with meter("splats of fields", len(families)) as progress:
-        for family in families:
-            views, held, _ = procedural_views(family, train, test, size, size)
-            field, seconds = trained("zipnerf", "fast", views, 0)
-            cameras = between(views.cameras, most_views)
-            shown = [field.render(cameras, i) for i in range(len(cameras))]
-            wanted = [field.render(held.cameras, i) for i in range(len(held))]
-            common = {"family": family, "field_cpu_s": seconds, "field_psnr_db": _psnr(wanted, held)}
-            for refinement in (0, steps):
-                started = time.process_time()
-                splats = splats_of(field, shown, cameras, steps=refinement)
-                used = time.process_time() - started
-                images = [render(splats, held.cameras, i) for i in range(len(held))]
-                rows.append(
-                    common | {"refinement": refinement, "splats": len(splats), "cpu_s": used,
-                              "psnr_to_field_db": _mean_psnr([r.image for r in images], [r.image for r in wanted]),
-                              "psnr_db": _psnr(images, held)} | _megabytes(splats)
-                )  # fmt: skip
-            progress.advance(note=f"{family} {rows[-1]['psnr_db']:.1f} dB")
+    for name, views, held in scenes:
+        field, seconds = trained("zipnerf", "fast", views, 0)
+        cameras = between(views.cameras, most_views)
+        started = time.process_time()
+        shown = [field.render(cameras, i) for i in range(len(cameras))]
+        rendering = time.process_time() - started
+        wanted = [field.render(held.cameras, i) for i in range(len(held))]
+        common = {"scene": name, "field_cpu_s": seconds, "render_cpu_s": rendering,
+                  "field_psnr_db": _psnr(wanted, held)}  # fmt: skip
+        for refinement in (0, steps):
+            started = time.process_time()
+            splats = splats_of(field, shown, cameras, steps=refinement)
+            used = time.process_time() - started
+            images = [render(splats, held.cameras, i) for i in range(len(held))]
+            rows.append(
+                common | {"refinement": refinement, "splats": len(splats), "cpu_s": used,
+                          "psnr_to_field_db": _mean_psnr([r.image for r in images], [r.image for r in wanted]),
+                          "psnr_db": _psnr(images, held)} | _megabytes(splats)
+            )  # fmt: skip
     return rows
 
 

@@ -19,7 +19,8 @@ from rich.table import Column, Table
 import cat3d_core
 from flows.bench.fronts import cell, verdict
 from flows.bench.page import panels_of, tables, worth_showing, write_page
-from flows.bench.registry import BENCHES, MissingError, Row
+from flows.bench.registry import BENCHES
+from flows.bench.rows import MissingError, Row
 from flows.errors import InputError, describe
 from flows.jobs.device import cpu_count
 from flows.pipeline.versions import provenance

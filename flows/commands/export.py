@@ -63,7 +63,7 @@ def export_command(
     settings: SurfaceSettings | None = None,
     path_file: Path | None = None,
 ) -> list[Path]:
-    """Write what is asked for (comma-separated KINDS; mesh, points and dataset if empty) to `out`; what was made.
+    """Write to `out` what is asked for (comma-separated KINDS; mesh, points, splats and dataset if empty); the files.
 
     Raises InputError for everything a user can correct.
     """
@@ -153,7 +153,7 @@ def _export_dataset(source: Source, cloud: PointCloud, folder: Path) -> Path:
     some = PointCloud(*(part[drawn] for part in cloud))
     cameras = source.frame_from_scene.cameras(views.cameras)
     points, normals, colours = _arrays(some)
-    images = [image.numpy() for image in views.images]
+    images = (image.numpy() for image in views.images)
     names = write_dataset(folder, cameras, images, views.captured_name, points, normals, colours)
     generated = sum(name is None for name in views.captured_name)
     console.print(f"dataset: {len(names) - generated} captured and {generated} generated views, {len(points)} points")

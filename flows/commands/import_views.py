@@ -42,7 +42,7 @@ def import_views_command(path: Path, folder: Path | None, run_name: str | None, 
                 run.generated.write_views("image", read_view(file), [view])
                 progress.advance()
         run.generated.set_attrs(imported=asdict(found), terms="")
-    console.print(f"{found} {_GO_ON.format(out=path.parent)}")
+    console.print(f"{found} {_GO_ON.format(out=path.parent)}", markup=False)
 
 
 def _forget(store: SceneStore, run: Run) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rich.markup import escape
 from rich.table import Table
 
 from cat3d_core.diffusion import SIZES, count_flops, count_parameters, describe
@@ -112,5 +113,5 @@ def _memory(need: Callable[[int, torch.dtype], Need] | None) -> dict[str, float]
 def _pairs(report: dict[str, Any], title: str) -> Table:
     table = Table("", "", title=title, show_header=False)
     for name, value in report.items():
-        table.add_row(name, json.dumps(value) if isinstance(value, (dict, list)) else str(value))
+        table.add_row(name, escape(json.dumps(value) if isinstance(value, (dict, list)) else str(value)))
     return table

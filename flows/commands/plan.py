@@ -11,6 +11,7 @@ from flows.jobs.request import Request
 from flows.media.plan_drawing import plan_table
 from flows.names import shown
 from flows.pipeline.runner import opened, run_missing
+from flows.pipeline.working_size import with_working_size
 from flows.progress import console
 from schemas.scene_store import SceneStore
 
@@ -21,7 +22,7 @@ def plan_command(request: Request, rows: int = 24) -> list[Job]:
     These stages are too short to need a server. Raises InputError, ConfigError and others.
     """
     with console.status(f"Reading {escape(shown(request.source))}"):
-        jobs = request.jobs()
+        jobs = with_working_size(request.jobs())
     if terms := generator_spec(jobs[0]).terms:
         console.print(terms)
     with opened(jobs[0]):

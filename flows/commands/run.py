@@ -14,7 +14,9 @@ from flows.generation.opening import opening
 from flows.jobs.job import Job
 from flows.jobs.request import Request, make_request
 from flows.names import shown
+from flows.pipeline.expected import expected
 from flows.pipeline.keys import Step, pending
+from flows.pipeline.working_size import with_working_size
 from flows.progress import console
 
 DEMO_SOURCE = "procedural:co3d/4?views=16&width=96&height=96"
@@ -24,7 +26,7 @@ def run_command(request: Request) -> list[Job]:
     """Do everything that is not done yet for one scene and its splits. Raises InputError, ConfigError and others."""
     started, out = time.monotonic(), request.out
     with console.status(f"Reading {escape(shown(request.source))}"):
-        jobs = request.jobs()
+        jobs = with_working_size(request.jobs())
         capture = jobs[0].capture()
         todo = {job.run: pending(job) for job in jobs}
     stored = f", stored as {capture.scene_id}" if capture.title != capture.scene_id else ""
@@ -37,6 +39,8 @@ def run_command(request: Request) -> list[Job]:
             console.print(f"  {job.run}: to do: " + ", ".join(f"{s.stage} ({s.why})" for s in steps), markup=False)
         else:
             console.print(f"  {job.run}: every stage is done already; nothing to do.")
+    if sentence := expected([(job, todo[job.run]) for job in jobs]):
+        console.print(sentence)
     if any(todo.values()):
         from flows.pipeline.server import prefect_server
 

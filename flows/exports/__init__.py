@@ -1,4 +1,5 @@
-"""What leaves a finished run: meshes, point clouds, data sets for other trainers, renders along a path.
+"""What leaves a run: meshes, point clouds, splats, data sets for other trainers, renders along a path, plans.
 
-`source` opens the run; `mesh`, `dataset`, `path` and `ply` each write one kind of thing.
+`source` opens a finished run and `plan` one with a plan; `mesh`, `dataset`, `path`, `ply` and `splats` (with
+`splat_files` and `preview`) each write one kind of thing.
 """

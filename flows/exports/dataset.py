@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from cat3d_core.cameras import Cameras
 from flows.errors import InputError
-from flows.exports.ply import write_bytes, write_ply
+from flows.exports.ply import write_ply
 from flows.media.images import write_png
 from flows.readers.parsing import from_opengl
 from flows.sfm.colmap import pycolmap
+from schemas.documents import write_bytes
 
 
 def write_dataset(
-    folder: Path, cameras: Cameras, images: list[np.ndarray], captured_name: list[str | None],
+    folder: Path, cameras: Cameras, images: Iterable[np.ndarray], captured_name: list[str | None],
     points: np.ndarray, normals: np.ndarray, colours: np.ndarray,
 ) -> list[str]:  # fmt: skip
     """Write images/*.png, transforms.json, sparse_pc.ply and sparse/0/*.txt; the names of the images.

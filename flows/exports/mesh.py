@@ -16,8 +16,9 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.normalization import Similarity
 from cat3d_core.rays import image_rays
 from flows.errors import InputError
-from flows.exports.ply import write_bytes, write_ply
+from flows.exports.ply import write_ply
 from flows.open3d_import import import_open3d
+from schemas.documents import write_bytes
 
 BLOCK = 8  # voxels per block side
 TRUNCATION = 5.0  # voxels, as zipnerf-pytorch's tsdf.py

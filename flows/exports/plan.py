@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +25,8 @@ from flows.progress import meter
 from flows.reconstruction.stored import read_reconstruction
 from schemas.scene_store import Run, SceneStore
 
+#: Photos that are warped into a planned view, at most.
+NEAREST = 48
 _READ_ME = """The views of a plan, to be made by any program.
 
 transforms.json (nerfstudio, OpenGL camera axes) and sparse/0 (COLMAP, text) hold the cameras of the photos in given/
@@ -40,13 +43,21 @@ by it (transparent where none shows the place).
 
 @dataclass(frozen=True)
 class PlanSource:
-    """A run with a plan; `scene`: what another or the same run reconstructed from these photos, None where none has."""
+    """A run with a plan."""
 
     store: SceneStore
     run: Run
     plan: Plan
-    scene: Reconstructor | None
     frame_from_scene: Similarity
+
+    @functools.cached_property
+    def scene(self) -> Reconstructor | None:
+        """What another or the same run reconstructed from these photos, None where none has."""
+        same = [name for name in self.store.runs() if self.store.record("reconstruct", name) is not None
+                and np.array_equal(self.store.run(name).read("role"), self.run.read("role"))]  # fmt: skip
+        planned = {name for name in same if self.store.record("plan", name) is not None}
+        same.sort(key=lambda name: (name in planned, name))  # rather of the photos alone
+        return read_reconstruction(self.store, self.store.run(same[0])) if same else None
 
 
 def open_plan(path: Path, run_name: str | None, frame: str) -> PlanSource:
@@ -62,17 +73,13 @@ def open_plan(path: Path, run_name: str | None, frame: str) -> PlanSource:
     if run.name not in planned:
         raise InputError(f"The run {run.name} of {path} has no plan; make it with `cat3d plan`.")
     plan = read_plan(run.plan, store.captured.shape("size")[0])
-    same = [name for name in store.runs() if store.record("reconstruct", name) is not None
-            and np.array_equal(store.run(name).read("role"), run.read("role"))]  # fmt: skip
-    same.sort(key=lambda name: (name in planned, name))  # rather of the photos alone
-    scene = read_reconstruction(store, store.run(same[0])) if same else None
-    return PlanSource(store, run, plan, scene, read_similarity(store).inverse() if frame == "world" else IDENTITY)
+    return PlanSource(store, run, plan, read_similarity(store).inverse() if frame == "world" else IDENTITY)
 
 
 def write_plan_folder(source: PlanSource, folder: Path, store_path: Path) -> int:
     """Write cameras, photos and hints; the number of planned views."""
     train = views_with_role(source.store, source.run, "train")
-    cameras, photos = read_cameras(source.store.captured, train), read_images(source.store.captured, train)
+    cameras, photos = read_cameras(source.store.captured, train), list(read_images(source.store.captured, train))
     names = [f"given/captured_{i:04d}.png" for i in range(len(train))]
     for part in ("given", "views"):
         (folder / part).mkdir(parents=True, exist_ok=True)
@@ -90,7 +97,7 @@ def write_plan_folder(source: PlanSource, folder: Path, store_path: Path) -> int
         count=len(planned), first=view_name(0), last=view_name(len(planned) - 1), width=width, height=height,
         store=store_path, run=source.run.name,
     )  # fmt: skip
-    (folder / "README.txt").write_text(text)
+    (folder / "README.txt").write_text(text, encoding="utf-8")
     if source.scene is not None:
         _write_hints(source, source.scene, cameras, photos, folder / "hints")
     return len(planned)
@@ -99,18 +106,16 @@ def write_plan_folder(source: PlanSource, folder: Path, store_path: Path) -> int
 def _write_hints(
     source: PlanSource, scene: Reconstructor, cameras: Cameras, photos: list[torch.Tensor], folder: Path
 ) -> None:
-    """Depth of each planned view by the reconstruction, and the photos warped by it, the nearest first."""
+    """Depth of each planned view by the reconstruction, and the nearest photos warped by it, the nearest first."""
     folder.mkdir(exist_ok=True)
     depths = [scene.render(cameras, i).depth.cpu().float() for i in range(len(cameras))]
-    colours = [photo.permute(2, 0, 1).float() / 255 for photo in photos]
     targets = source.plan.cameras
     with meter(f"hints {source.store.scene_id} {source.run.name}", len(targets)) as progress:
         for view in range(len(targets)):
             depth = scene.render(targets, view).depth.cpu().float()
-            order = (cameras.centers - targets.centers[view]).norm(dim=-1).argsort().tolist()
-            image, seen = warp(
-                [colours[i] for i in order], [depths[i] for i in order], cameras[order], targets[view], depth
-            )
+            order = (cameras.centers - targets.centers[view]).norm(dim=-1).argsort()[:NEAREST].tolist()
+            colours = [photos[i].permute(2, 0, 1).float() / 255 for i in order]
+            image, seen = warp(colours, [depths[i] for i in order], cameras[order], targets[view], depth)
             name = Path(view_name(view))
             np.save(folder / f"{name.stem}_depth.npy", (depth * source.frame_from_scene.scale).numpy())
             rgba = torch.cat([image, seen[None].float()]).permute(1, 2, 0)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
+
+from schemas.documents import write_bytes
 
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4"),
                   ("red", "u1"), ("green", "u1"), ("blue", "u1")])  # fmt: skip
@@ -30,13 +31,3 @@ def write_ply(
         triangles["count"], triangles["vertex_indices"] = 3, faces
         body += triangles.tobytes()
     write_bytes(path, "\n".join([*header, "end_header\n"]).encode("ascii") + body)
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file at once or not at all."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        partial.write_bytes(content)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)

@@ -2,26 +2,40 @@
 
 from __future__ import annotations
 
-import os
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.reconstruction import Reconstructor
 from cat3d_core.splats import Gaussians, Splats
 from cat3d_core.splats.viewpoints import between
+from cat3d_core.weights_file import read_weights
 from flows.exports.splats import splats_of
 from flows.progress import meter
+from schemas.documents import write_bytes
 from schemas.scene_store import Run, SceneStore
 
 MOST = 100_000
 """3.2 MB for the browser."""
-VIEWS, SIDE, STEPS = 48, 96, 200
-"""Cameras that are rendered for it, the longer side of what they see, in pixels, and steps of refinement: about a
-minute of one core for a field of the preset fast."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """views: cameras that are rendered; side: of what they see, the longer one, in pixels; steps: of refinement."""
+
+    views: int
+    side: int
+    steps: int
+
+
+FINISHED = Effort(48, 96, 200)
+"""About a minute of one core for a field of the preset fast."""
+UNDER_WAY = Effort(24, 48, 0)
+"""Some seconds, as another one follows with the next checkpoint of the training, which needs the core itself."""
 VERSION = 1
 
 
@@ -36,44 +50,47 @@ def kept_preview(store: SceneStore, run: Run) -> Gaussians | None:
     if key is None or not path.exists():
         return None
     try:
-        with safe_open(path, "pt") as file:
-            if (file.metadata() or {}).get("key") != key:
-                return None
-            return Gaussians.from_tensors({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError):
+        metadata, tensors = read_weights(path)
+        return Gaussians.from_tensors(tensors) if metadata.get("key") == key else None
+    except (OSError, ValueError):
         return None  # a damaged one is made again
 
 
-def make_preview(store: SceneStore, run: Run, scene: Reconstructor, cameras: Cameras) -> Gaussians:
-    """Splats of a reconstruction from what some of the cameras (scene frame) see; those of a finished one are kept."""
+def make_preview(
+    store: SceneStore, run: Run, scene: Reconstructor, cameras: Cameras, before_each: Callable[[], object] = bool
+) -> Gaussians:
+    """Splats of a reconstruction from what some of the cameras (scene frame) see; those of a finished one are kept.
+
+    `before_each` is called before each view and step; it may wait, or raise to end the work.
+    """
+    key = _key(store, run)
     if isinstance(scene, Splats):
         splats = splats_of(scene, [], cameras, MOST)
     else:
-        some = between(cameras, VIEWS)
-        scales = [min(1.0, SIDE / float(size.max())) for size in some.size]
-        some = Cameras.cat([some[i].resize(*_scaled(some.size[i], scale)) for i, scale in enumerate(scales)])
-        some = some.to(dtype=torch.float32)
+        effort = UNDER_WAY if key is None else FINISHED
+        some = between(cameras, effort.views)
+        some = Cameras.cat([within(some[i], effort.side) for i in range(len(some))]).to(dtype=torch.float32)
         renders = []
         with meter(f"splats of {store.scene_id} {run.name}", len(some)) as progress:
             for i in range(len(some)):
+                before_each()
                 render = scene.render(some, i)
                 renders.append(type(render)(**{name: value.cpu() for name, value in vars(render).items()}))
                 progress.advance()
-        splats = splats_of(scene, renders, some, MOST, STEPS)
-    key = _key(store, run)
+        splats = splats_of(scene, renders, some, MOST, effort.steps, before_each)
     if key is not None:
         path = preview_path(store, run)
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(f".{os.getpid()}.part")
         tensors = {name: value.contiguous() for name, value in splats.tensors().items()}
-        save_file(tensors, part, metadata={"key": key})
-        os.replace(part, path)
+        write_bytes(path, save(tensors, {"key": key}))
     return splats
 
 
-def _scaled(size: torch.Tensor, scale: float) -> tuple[int, int]:
-    width, height = (max(1, round(float(side) * scale)) for side in size)
-    return width, height
+def within(camera: Cameras, side: int) -> Cameras:
+    """One camera with the longer side of its image at most so many pixels."""
+    width, height = (int(length) for length in camera.size[0])
+    shrink = min(1.0, side / max(width, height))
+    return camera.resize(max(1, round(width * shrink)), max(1, round(height * shrink)))
 
 
 def _key(store: SceneStore, run: Run) -> str | None:

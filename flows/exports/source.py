@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import torch
@@ -50,11 +51,11 @@ def open_source(path: Path, run_name: str | None, frame: str) -> Source:
 
 @dataclass(frozen=True)
 class PosedImages:
-    """Views the field was trained on: cameras (N) in the scene frame; images N x (h, w, 3) uint8; for each its name in
-    the data set, or None for a generated view."""
+    """Views the field was trained on: cameras (N) in the scene frame; images N x (h, w, 3) uint8, once and one at a
+    time; for each its name in the data set, or None for a generated view."""
 
     cameras: Cameras
-    images: list[torch.Tensor]
+    images: Iterable[torch.Tensor]
     captured_name: list[str | None]
 
 
@@ -62,14 +63,14 @@ def training_images(source: Source) -> PosedImages:
     """The run's captured training views, then its generated views where it has them. Held-out views are left out."""
     store, run = source.store, source.run
     train = views_with_role(store, run, "train")
-    cameras, images = [read_cameras(store.captured, train)], read_images(store.captured, train)
+    cameras, images = [read_cameras(store.captured, train)], []
     names: list[str | None] = [str(name) for name in store.captured.read("name")[train]]
     if "done_image" in run.generated:
         for camera, image, *_ in generated_views(run):
             cameras.append(camera)
             images.append(image)
             names.append(None)
-    return PosedImages(Cameras.cat(cameras), images, names)
+    return PosedImages(Cameras.cat(cameras), chain(read_images(store.captured, train), images), names)
 
 
 def surface_cameras(source: Source, limit: int) -> Cameras:

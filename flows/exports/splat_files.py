@@ -14,7 +14,8 @@ import torch
 from cat3d_core.normalization import Similarity
 from cat3d_core.splats.gaussians import SH_0, Gaussians
 from flows.errors import InputError
-from flows.exports.ply import write_bytes
+from flows.media.packed import gunzip
+from schemas.documents import write_bytes
 
 SPZ_MAGIC, SPZ_VERSION, SPZ_ANTIALIASED = 0x5053474E, 3, 1
 SPZ_SCALES = (-10.0, 255 / 16 - 10.0)
@@ -143,9 +144,9 @@ def write_spz(path: Path, gaussians: Gaussians, antialias: bool = True) -> None:
 def read_spz(path: Path) -> Gaussians:
     """Read a .spz of version 3, up to degree 2. Raises InputError for another version or a damaged file."""
     try:
-        raw = gzip.decompress(path.read_bytes())
+        raw = gunzip(path)
         magic, version, count, degree, bits, _, _ = struct.unpack_from("<IIIBBBB", raw)
-    except (OSError, EOFError, struct.error) as error:
+    except struct.error as error:
         raise InputError(f"{path} is no .spz file or damaged ({error}).") from None
     widths = [9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)]
     if magic != SPZ_MAGIC or version != SPZ_VERSION or degree > 2 or len(raw) != 16 + count * sum(widths):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -22,10 +22,12 @@ MOST = 200_000
 
 
 def splats_of(
-    scene: Reconstructor, renders: Sequence[Render], cameras: Cameras, most: int = MOST, steps: int = REFINE.iterations
-) -> Gaussians:
+    scene: Reconstructor, renders: Sequence[Render], cameras: Cameras, most: int = MOST,
+    steps: int = REFINE.iterations, before_each: Callable[[], object] = bool,
+) -> Gaussians:  # fmt: skip
     """At most `most` Gaussians (scene frame): those of splats themselves; of another reconstruction those of its
-    renders, refined in so many steps to look like them."""
+    renders, refined in so many steps to look like them. `before_each` is called before each step; it may wait, or raise
+    to end the work."""
     if isinstance(scene, Splats):
         found = scene.gaussians.to("cpu")
         # What is seen least is left out first.
@@ -39,9 +41,10 @@ def splats_of(
     trainer = SplatTrainer(dataclasses.replace(REFINE, iterations=steps), views, 0, first=first)
     with meter("refine the splats", steps) as progress:
         while not trainer.finished:
+            before_each()
             numbers = trainer.step()
             progress.advance(note=f"{numbers['psnr']:.1f} dB")
-    return Gaussians(**{name: value.detach() for name, value in trainer.gaussians.tensors().items()})
+    return trainer.gaussians.detach()
 
 
 def write_splats(folder: Path, gaussians: Gaussians, frame_from_scene: Similarity) -> tuple[list[Path], list[str]]:

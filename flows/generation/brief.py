@@ -39,7 +39,9 @@ def shown_by_captured(job: Job, views: Views) -> Tensor:
     A brief reconstruction of the captured views alone says where that place is."""
     captured, generated = (torch.nonzero(chosen)[:, 0].tolist() for chosen in (views.captured, ~views.captured))
     known = views.cameras[captured]
-    photos = Views.from_images(known, [views.image(v) for v in captured], views.captured[captured])
+    whole = bool((views.counting == views.size.prod(-1))[views.captured].all())
+    masks = None if whole or views.valid is None else [views.map(views.valid, v) for v in captured]
+    photos = Views.from_images(known, (views.image(v) for v in captured), views.captured[captured], masks)
     brief = brief_reconstruction(job, photos)
     with cpu_threads(job.config.execution.threads):
         depths = [brief_render(brief, known, view).depth.cpu() for view in range(len(captured))]

@@ -14,6 +14,7 @@ from cat3d_core.plan import Group
 from cat3d_core.random import normal
 from cat3d_core.sample_sets import KINDS, sample_cameras
 from cat3d_core.view_selection import pose_distance
+from flows.generation.hints import StoredHint, read_hint
 from flows.generation.plan import read_plan
 from flows.generation.views import captured_sample
 from flows.jobs.access import read_cameras
@@ -27,8 +28,9 @@ CAPTURED_LATENTS = dict(zip(KINDS, ("captured", "captured_wide"), strict=True))
 class StoredPlan:
     """The plan of a run as the sampler needs it, read once; `plan` counts the store's captured views."""
 
-    def __init__(self, store: SceneStore, run: Run, seed: int) -> None:
-        self.store, self.run, self.seed = store, run, seed
+    def __init__(self, store: SceneStore, run: Run, seed: int, hinted: bool = True) -> None:
+        """hinted: what the run has of hints is used."""
+        self.store, self.run, self.seed, self.hinted = store, run, seed, hinted
         self.captured_count = store.captured.shape("size")[0]
         self.plan = read_plan(run.plan, self.captured_count)
         size = int(self.plan.cameras.size[0, 0])
@@ -65,7 +67,16 @@ class StoredPlan:
             images=self._images(group, latents, generator) if "images" in generator.spec.wants else None,
             scene=self.captured[group.kind],
             planned=self._planned(group.kind) if "planned" in generator.spec.wants else None,
+            hints=self._hints(group) if "hints" in generator.spec.wants else {},
         )
+
+    def _hints(self, group: Group) -> dict[str, Tensor]:
+        """What the photos show of the targets, where the run has it."""
+        if not self.hinted or "hints" not in self.run:
+            return {}
+        rows = [read_hint(self.run, view) for view in group.targets]
+        maps = {name: torch.stack([getattr(row, name) for row in rows]) for name in StoredHint._fields}
+        return maps | {"colour": maps["colour"].permute(0, 3, 1, 2) / 255}
 
     def _planned(self, kind: str) -> Cameras:
         """The cameras of all planned views of a sample set."""

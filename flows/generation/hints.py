@@ -53,9 +53,10 @@ def read_hint(run: Run, view: int) -> StoredHint:
     return StoredHint(torch.from_numpy(section.read("colour", [view])[0]), *maps)
 
 
-def explained_views(run: Run) -> np.ndarray:
-    """(N,) bool: the planned views that the photos show wholly; none where the run has no hints."""
-    if "hints" not in run:
+def explained_views(job: Job, run: Run) -> np.ndarray:
+    """(N,) bool: the planned views that the photos show wholly; none where the job uses no hints (those of an earlier
+    run may still lie there)."""
+    if not job.hinted or "hints" not in run:
         return np.zeros(run.plan.shape("size")[0], bool)
     return run.section("hints").read("explained")
 

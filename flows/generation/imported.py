@@ -97,7 +97,7 @@ def find_views(folder: Path, cameras: Cameras, partial: bool) -> dict[int, Path]
         if (size := list(image_size(path))) != (wanted := cameras.size[view].tolist()):
             raise InputError(
                 f"{path} is {size[0]} x {size[1]} pixels, but the plan's views are {wanted[0]} x {wanted[1]}: make it "
-                "in that size, or plan in its (plan.image_size)."
+                "that large, or plan views of its size (plan.image_size)."
             )
     return dict(sorted(found.items()))
 

@@ -36,12 +36,13 @@ def opening(job: Job) -> list[str]:
     if there is not None and there < wanted:
         raise InputError(
             f"Memory is too small: {of} needs {each}, with allowance {wanted / 2**30:.1f} GiB in all, and "
-            f"{there / 2**30:.1f} GiB are free on {device()}. {_remedy(job, processes)}"
+            f"{there / 2**30:.1f} GiB are free on {device()}. {_remedy(job, processes, spec.at is not None)}"
         )
     return [*out, f"Memory: {of} needs {each}."]
 
 
-def _remedy(job: Job, processes: int) -> str:
+def _remedy(job: Job, processes: int, resizable: bool) -> str:
+    """What needs less memory; resizable: the generator also takes smaller windows and images."""
     settings = job.config.execution
     ways = []
     if processes > 1:
@@ -50,5 +51,7 @@ def _remedy(job: Job, processes: int) -> str:
         ways.append("execution.groups_at_once=1")
     if job.config.sample.precision == "float32":
         ways.append("sample.precision=bfloat16")
+    if resizable:
+        ways.append("a smaller plan.window or plan.image_size")
     ways.append("a device with more memory")
     return f"What helps: {', '.join(ways)}."

@@ -23,7 +23,7 @@ from flows.generation.groups import StoredPlan
 from flows.generation.hints import explained_views
 from flows.generation.open import open_generator
 from flows.generation.views import finished, in_window
-from flows.jobs.access import read_cameras, read_images, views_with_role
+from flows.jobs.access import read_cameras, read_images, read_masks, views_with_role
 from flows.jobs.job import Job
 from flows.media.images import resize, to_uint8
 from schemas.decisions import chosen as decided
@@ -108,26 +108,34 @@ class Rounds(OneRound):
     def views(self, groups: list[int]) -> Views:
         """Captured training views but the held-out one, and the decoded views of the groups."""
         shown = [v for v in self.train if v != self.held_out]
-        cameras, images = read_cameras(self.store.captured, shown), read_images(self.store.captured, shown)
+        cameras, images = read_cameras(self.store.captured, shown), list(read_images(self.store.captured, shown))
+        masks = read_masks(self.store, shown)
         run = self.store.run(self.job.run)
-        generator, explained = open_generator(self.job), explained_views(run)
+        generator, explained = open_generator(self.job), explained_views(self.job, run)
         windows = self.plan.plan.window.tolist()
         for view in (v for g in groups for v in self.plan.groups[g].targets):
             made = to_uint8(finished(self.job, generator, run, view, bool(explained[view]))[0])
             camera, image = in_window(self.plan.cameras[view], made, windows[view])
             cameras, images = Cameras.cat([cameras, camera]), [*images, image]
-        return Views.from_images(cameras, images, torch.arange(len(cameras)) < len(shown))
+        if masks is not None:
+            masks += [None] * (len(cameras) - len(shown))
+        return Views.from_images(cameras, images, torch.arange(len(cameras)) < len(shown), masks)
 
     def brief(self, groups: list[int]) -> Reconstructor:
         """A brief reconstruction of the captured views but the held-out one, and of the views of the groups."""
         return brief_reconstruction(self.job, self.views(groups))
 
     def held_out_psnr(self, brief: Reconstructor) -> float:
-        """PSNR in dB of the held-out captured view, as `brief_render` shows it."""
+        """PSNR in dB of the held-out captured view, inside its mask if it has one, as `brief_render` shows it."""
         camera = read_cameras(self.store.captured, [self.held_out])
         image = brief_render(brief, camera, 0).image.cpu()
         truth = resize(self.store.captured.read_image("image", self.held_out), image.shape[1], image.shape[0])
-        return -10 * math.log10(float((image - torch.from_numpy(truth) / 255).square().mean()) + 1e-10)
+        error = (image - torch.from_numpy(truth) / 255).square().mean(-1)
+        masks = read_masks(self.store, [self.held_out])
+        if masks is not None and masks[0] is not None:
+            inside = resize(masks[0].numpy().astype(np.uint8) * 255, image.shape[1], image.shape[0]) >= 128
+            error = error[torch.from_numpy(inside)] if inside.any() else error
+        return -10 * math.log10(float(error.mean()) + 1e-10)
 
     def unknown(self, brief: Reconstructor, group: int) -> float:
         """In [0, 1]: how uncertain the reconstruction is of the group's middle view, or how much of it no view has

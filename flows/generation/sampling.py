@@ -31,7 +31,8 @@ def sampler_config(job: Job, shortened: bool | None = None) -> SamplerConfig:
     own = {name: value for name in _CHOSEN if (value := getattr(settings, name)) is not None}
     try:
         guidance = replace(base.guidance, scale=scale, low_log_snr=low, high_log_snr=high)
-        return replace(base, **own, guidance=guidance, micro_batch=job.config.execution.groups_at_once)
+        at_once = job.config.execution.groups_at_once
+        return replace(base, **own, guidance=guidance, micro_batch=at_once, start=settings.start)
     except ValueError as error:
         raise ConfigError(f"The settings of `sample` don't work: {error}") from None
 
@@ -40,6 +41,8 @@ def sampler_settings(job: Job) -> dict[str, Any]:
     """All that decides how the job samples, as JSON values: part of the content key of what is sampled."""
     config = sampler_config(job)
     chosen = {name: getattr(config, name) for name in _CHOSEN} | {"guidance": config.guidance.scale}
+    if config.start != "noise":
+        chosen |= {"start": config.start}
     return chosen | {"guidance_log_snr": _interval(config.guidance), "near_steps": job.config.skip.near_steps}
 
 

@@ -25,6 +25,7 @@ from flows.jobs.scene import file_sha256
 from flows.media.images import write_png
 from flows.progress import console
 from flows.readers.photos import PROMPT_SETTINGS as SETTINGS
+from schemas.documents import write_bytes
 from schemas.errors import ConfigError
 
 
@@ -72,7 +73,7 @@ def text_to_photo(prompt: Prompt, out: Path) -> Path:
     (folder / SETTINGS).unlink(missing_ok=True)
     write_png(folder / "photo.png", made)
     document = {"settings": wanted, "photo_sha256": file_sha256(folder / "photo.png")}
-    (folder / SETTINGS).write_text(json.dumps(document, indent=1), encoding="utf-8")
+    write_bytes(folder / SETTINGS, json.dumps(document, indent=1).encode())
     console.print(f"The photo of “{prompt.text}”: {folder / 'photo.png'}")
     return folder
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -55,9 +55,10 @@ def views_with_role(store: SceneStore, run: Run, role: str) -> list[int]:
     return views
 
 
-def read_images(section: Section, views: Sequence[int]) -> list[torch.Tensor]:
-    """Images of the views, each (h, w, 3) uint8 without padding."""
-    return [torch.from_numpy(np.ascontiguousarray(section.read_image("image", v))) for v in views]
+def read_images(section: Section, views: Sequence[int]) -> Iterator[torch.Tensor]:
+    """Images of the views, each (h, w, 3) uint8 without padding, read when it is asked for: together they may be more
+    than the memory holds."""
+    return (torch.from_numpy(np.ascontiguousarray(section.read_image("image", v))) for v in views)
 
 
 def read_masks(store: SceneStore, views: Sequence[int]) -> list[torch.Tensor | None] | None:

@@ -50,14 +50,24 @@ def available_memory() -> int | None:
 
 
 def total_memory() -> int | None:
-    """Bytes of main memory that this process may use: the machine's, or less where a cgroup (a container, a job of
-    SLURM) says so; None where the system doesn't say."""
-    limits = []
+    """Bytes that this process's device has; None where the system doesn't say."""
+    where = device()
+    if where == "cuda":
+        return int(torch.cuda.get_device_properties(0).total_memory)
+    if where == "mps":
+        return int(torch.mps.recommended_max_memory())
+    return main_memory()
+
+
+def main_memory() -> int | None:
+    """Bytes of the machine's memory, or of its container's or SLURM job's share; None where the system doesn't say."""
+    found = []
     with contextlib.suppress(AttributeError, OSError, ValueError):
-        limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    with contextlib.suppress(OSError, ValueError), open("/sys/fs/cgroup/memory.max") as file:
-        limits.append(int(file.read()))
-    return min(limits, default=None)
+        found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    for limit in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        with contextlib.suppress(OSError, ValueError), open(limit) as file:
+            found.append(int(file.read()))  # "max", where there is no limit, is no number
+    return min(found, default=None)
 
 
 def visible_gpus() -> list[str]:

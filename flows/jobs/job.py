@@ -16,7 +16,10 @@ from schemas.decisions import Decision
 
 
 class Job(BaseModel):
-    """One run of one scene: where it comes from, which views train, how, and where results go. JSON in, JSON out."""
+    """One run of one scene: where it comes from, which views train, how, and where results go. JSON in, JSON out.
+
+    working_size: why the photos are made smaller, where that was chosen here (`flows/pipeline/working_size.py`).
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -29,6 +32,7 @@ class Job(BaseModel):
     config: RunConfig
     store: Path | None = None
     results: Path | None = None
+    working_size: str = ""
 
     _scene: Scene = PrivateAttr()
 

@@ -38,6 +38,10 @@ class Request:
     reader: str = "auto"
     image_folder: str | None = None
 
+    def scene(self) -> Scene:
+        """Where the scene lies, to be found from anywhere."""
+        return Scene(source_text(absolute(self.source)), self.reader, self.image_folder, self.config.ingest.frames)
+
     def jobs(self, scene: Scene | None = None) -> list[Job]:
         """A job for each split, with `generate: auto` decided. scene: where that was read already.
 
@@ -48,8 +52,7 @@ class Request:
                 check_solver(self.config.sample.solver)
             except ValueError as error:
                 raise ConfigError(f"sample.solver: {error}") from None
-        text = source_text(absolute(self.source))
-        scene = scene or Scene(text, self.reader, self.image_folder, self.config.ingest.frames)
+        scene = scene or self.scene()
         jobs = []
         for split in self.views:
             job = Job(

@@ -28,8 +28,10 @@ def text_embedding(text: str) -> Tensor | None:
     except ImportError:
         return None
     try:
-        tokenizer = AutoTokenizer.from_pretrained(str(folder), local_files_only=True)
-        tower = CLIPTextModelWithProjection.from_pretrained(str(folder), local_files_only=True, use_safetensors=True)
+        tokenizer = AutoTokenizer.from_pretrained(str(folder), local_files_only=True)  # nosec B615 # a folder here
+        tower = CLIPTextModelWithProjection.from_pretrained(  # nosec B615 # a folder here
+            str(folder), local_files_only=True, use_safetensors=True
+        )
     except (OSError, ValueError) as error:
         raise InputError(f"{VARIABLE}: no text tower of CLIP in {folder}: {' '.join(str(error).split())}") from None
     tokens = tokenizer(text, return_tensors="pt", truncation=True)

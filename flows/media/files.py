@@ -160,19 +160,6 @@ def _oiio_input(path: str) -> Any:
 
 
 @contextmanager
-def plain_folder(folder: Path) -> Iterator[Path]:
-    """The folder under a name that OpenImageIO takes literally: its own, or a link to it in a temporary folder."""
-    text = str(folder)
-    if SIMPLE_PATH.fullmatch(text) and text.isascii():
-        yield folder
-        return
-    with tempfile.TemporaryDirectory(prefix="cat3d-") as temporary:
-        link = Path(temporary) / "folder"
-        link.symlink_to(folder.resolve())
-        yield link
-
-
-@contextmanager
 def _simple_path(path: Path) -> Iterator[str]:
     """A path that OpenImageIO takes literally: the file's own, or a link to it in a temporary folder."""
     text = str(path)

@@ -6,25 +6,27 @@ area, as `Cameras.resize` does, and `undistort` keeps the image size and returns
 
 from __future__ import annotations
 
-import os
-import re
-import threading
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from flows.errors import InputError
-from flows.media.files import MAX_PIXELS, first_line, opened, plain_folder
+from flows.media.files import MAX_PIXELS, first_line, opened
 from flows.media.lens import distorted_pixels, filling_zoom
+from schemas.documents import write_bytes
 
 #: sRGB grey around images that are padded to squares: the middle of the range the autoencoder knows.
 PADDING = 128
+#: Formats that are written, by extension.
+FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
+#: Pixels that are undistorted at a time.
+STRIP_PIXELS = 1 << 20
 
 
 def read_image(
@@ -130,23 +132,28 @@ def undistort(
     height, width = image.shape[:2]
     new = intrinsics.clone()
     new[0, 0], new[1, 1] = intrinsics[[0, 1], [0, 1]] * filling_zoom(intrinsics, distortion, width, height, fisheye)
-    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    source = distorted_pixels(torch.stack([columns, rows], -1).double(), new, intrinsics, distortion, fisheye)
-    # In grid_sample without align_corners -1 to 1 is the area of the image.
-    grid = (2 * source / torch.tensor([width, height]) - 1).float()
-    mode = "nearest" if nearest else "bicubic"
-    out = F.grid_sample(_planes(image), grid[None], mode=mode, padding_mode="border", align_corners=False)
-    return _from_planes(out, image.ndim), new
+    planes, out = _planes(image), np.empty_like(image)
+    rows = max(1, STRIP_PIXELS // width)
+    for first in range(0, height, rows):  # the positions of all pixels of a large photo would take gigabytes
+        last = min(first + rows, height)
+        y, x = torch.meshgrid(torch.arange(first, last) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+        source = distorted_pixels(torch.stack([x, y], -1).double(), new, intrinsics, distortion, fisheye)
+        # In grid_sample without align_corners -1 to 1 is the area of the image.
+        grid = (2 * source / torch.tensor([width, height]) - 1).float()
+        mode = "nearest" if nearest else "bicubic"
+        strip = F.grid_sample(planes, grid[None], mode=mode, padding_mode="border", align_corners=False)
+        out[first:last] = _from_planes(strip, image.ndim)
+    return out, new
 
 
 def write_png(path: Path | str, image: np.ndarray | Tensor) -> None:
     """Write (H, W, 3), (H, W, 4) or (H, W), uint8 or [0, 1] floats, at once or not at all."""
-    _write(Path(path), to_uint8(image), {"png:compressionLevel": 4})
+    _write(Path(path), to_uint8(image), compress_level=4)
 
 
 def write_jpeg(path: Path | str, image: np.ndarray | Tensor, quality: int = 93) -> None:
     """Write an image as JPEG, without alpha or chroma subsampling (4:4:4); otherwise like `write_png`."""
-    _write(Path(path), to_uint8(image), {"Compression": f"jpeg:{quality}", "jpeg:subsampling": "4:4:4"})
+    _write(Path(path), to_uint8(image), quality=quality, subsampling=0)
 
 
 def _channel_ids(channels: list[str], path: Path) -> tuple[list[int], int | None]:
@@ -185,20 +192,19 @@ def _from_planes(planes: Tensor, ndim: int) -> np.ndarray:
     return image[..., 0] if ndim == 2 else image
 
 
-def _write(path: Path, pixels: np.ndarray, attributes: dict[str, Any]) -> None:
-    pixels = np.ascontiguousarray(pixels if pixels.ndim == 3 else pixels[..., None])
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "uint8")
-    for name, value in (attributes | {"oiio:UnassociatedAlpha": 1}).items():
-        spec[name] = value
-    with plain_folder(path.parent) as folder:
-        partial = folder / f".cat3d-{os.getpid()}-{threading.get_ident()}{path.suffix}"
-        target = oiio.ImageOutput.create(str(partial)) if re.fullmatch(r"\.[A-Za-z0-9]+", path.suffix) else None
-        if target is None:
-            raise InputError(f"{path} has no extension of an image format; end it in .png or .jpg.")
-        try:
-            written = target.open(str(partial), spec) and target.write_image(pixels)
-            if not (target.close() and written):
-                raise InputError(f"{path} cannot be written ({first_line(target.geterror())}).")
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
+def _write(path: Path, pixels: np.ndarray, **options: Any) -> None:
+    """Encode in memory, then write: libraries of image formats pass over writes that the system refuses, or end the
+    process."""
+    from PIL import Image
+
+    kind = FORMATS.get(path.suffix.lower())
+    if kind is None:
+        raise InputError(f"{path} has no extension of an image format that is written; end it in .png or .jpg.")
+    if kind == "JPEG" and pixels.ndim == 3:
+        pixels = pixels[..., :3]
+    encoded = io.BytesIO()
+    Image.fromarray(pixels).save(encoded, kind, **options)
+    try:
+        write_bytes(path, encoded.getvalue())
+    except OSError as error:
+        raise InputError(f"{path} cannot be written ({error.strerror or error}).") from None

@@ -42,10 +42,20 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray | Tensor], fps: fl
             count += 1
         if writer is None:
             raise InputError(f"There are no frames to write into {path}.")
-        writer.close()
+        writer.close()  # which does not say how ffmpeg ended
+        if not _is_whole(partial, count):
+            raise InputError(f"{path} cannot be written: not all of it reached the disk, which may be full.")
         os.replace(partial, path)
         return count
     finally:
         if writer is not None:
             writer.close()
         partial.unlink(missing_ok=True)
+
+
+def _is_whole(path: Path, count: int) -> bool:
+    """Whether the file is a video of `count` frames, read without decoding them."""
+    try:
+        return int(imageio_ffmpeg.count_frames_and_secs(str(path))[0]) == count
+    except (OSError, RuntimeError):
+        return False

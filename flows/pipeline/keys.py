@@ -81,9 +81,10 @@ def pending(job: Job, steps: dict[str, Step] | None = None) -> list[Step]:
     except MissingError:
         return [replace(step, why="not done yet") for step in steps.values()]
     reasons = {name: stale_reason(store, job.run, step) for name, step in steps.items()}
-    for one in stages_of(job):
+    own = [stage(name) for name in steps]
+    for one in own:
         if one.passing and store.record(one.name, job.run) is not None:
-            readers = [reader.name for reader in stages_of(job) if one.name in reader.reads]
+            readers = [reader.name for reader in own if one.name in reader.reads]
             if not any(reasons[name] for name in readers):
                 reasons[one.name] = ""
     return [replace(step, why=reasons[name]) for name, step in steps.items() if reasons[name]]

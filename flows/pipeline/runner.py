@@ -17,11 +17,15 @@ from flows.pipeline.keys import Step, pending, stage, upstream
 from flows.pipeline.locks import writing
 from flows.pipeline.versions import provenance
 from flows.progress import console
+from schemas.documents import sync_tree
 from schemas.errors import StoreError
 from schemas.layout import ROLES
-from schemas.scene_store import SceneStore
+from schemas.scene_store import Run, SceneStore
 from schemas.stages import StageRecord, now
 from schemas.tables import TIMINGS, append_rows
+
+#: A file server's clock may be behind ours by so much (seconds).
+CLOCKS_DIFFER_S = 60.0
 
 
 @contextlib.contextmanager
@@ -33,13 +37,15 @@ def opened(job: Job) -> Iterator[None]:
 
 
 def execute_stage(job: Job, step: Step) -> StageRecord:
-    """Do the work of a stage, then record it: data first, record last."""
+    """Do the work of a stage, then record it: data first, on the disk and not only on its way there, record last."""
     store = SceneStore.open(job.store_path, "r+")
     # Taken back before the data changes: a kill in between must not leave a record of what is no longer there.
     store.forget(step.stage, job.run)
-    started_at, started = now(), time.monotonic()
+    started_at, started, clock_s = now(), time.monotonic(), time.time()
     with measured() as usage:
         outcome = stage(step.stage).execute(job, store, step.key)
+    for written in (store.folder, job.pictures):
+        sync_tree(written, clock_s - CLOCKS_DIFFER_S)
     record = StageRecord(
         stage=step.stage,
         key=step.key,
@@ -133,6 +139,15 @@ def prepare_run(job: Job) -> None:
     roles = np.zeros(len(job.capture()), np.uint8)
     for role in ("train", "test"):
         roles[job.split[role]] = ROLES[role]
-    if "role" not in run or not np.array_equal(run.read("role"), roles):
+    if not np.array_equal(_stored_roles(run), roles):
         run.write("role", roles)
     run.set_attrs(job=job.model_copy(update={"store": None, "results": None}).model_dump(mode="json"))
+
+
+def _stored_roles(run: Run) -> np.ndarray:
+    """The role of each captured view as it is stored, none where it is not or cannot be read: no stage makes it again,
+    so damage to it is mended here."""
+    try:
+        return run.read("role")
+    except StoreError:
+        return np.zeros(0, np.uint8)

@@ -12,7 +12,6 @@ import contextlib
 import ctypes
 import multiprocessing
 import os
-import shutil
 import signal
 import socket
 import sqlite3
@@ -24,7 +23,9 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
+from flows.disk import naming_full_disk
 from flows.errors import ServerError
+from schemas.documents import write_bytes
 
 START_TIMEOUT_S = 120.0
 _PR_SET_PDEATHSIG = 1
@@ -57,9 +58,16 @@ def _without_proxy() -> str:
 def prefect_server(home: Path) -> Iterator[str]:
     """Yield the API address of a running server; must be entered before any flow is run.
 
-    home: folder for the server's database (created). Raises ServerError when no server answers in START_TIMEOUT_S.
-    SIGTERM is turned into SystemExit(143) while the server runs, so that `finally` blocks are reached.
+    home: folder for the server's database (created). Raises ServerError when no server answers in START_TIMEOUT_S, and
+    StoreError for whatever fails in it because the disk is full. SIGTERM is turned into SystemExit(143) while the
+    server runs, so that `finally` blocks are reached.
     """
+    with naming_full_disk(home), _server(home) as url:
+        yield url
+
+
+@contextlib.contextmanager
+def _server(home: Path) -> Iterator[str]:
     given = os.environ.get("PREFECT_API_URL")
     if given:
         _wait_until_healthy(given, None, 10.0)
@@ -73,9 +81,10 @@ def prefect_server(home: Path) -> Iterator[str]:
     for name in theirs:
         del os.environ[name]
     os.environ.update(environment)
-    template = _template_path()
-    if template is not None and not (home / "prefect.db").exists() and template.exists():
-        shutil.copyfile(template, home / "prefect.db")
+    template, database = _template_path(), home / "prefect.db"
+    fresh = not database.exists()
+    if fresh and template is not None and template.exists():
+        write_bytes(database, template.read_bytes())  # whole or, where the disk is full, not at all
     port = _free_port()
     url = f"http://127.0.0.1:{port}/api"
     log_path = home / "server.log"
@@ -90,9 +99,13 @@ def prefect_server(home: Path) -> Iterator[str]:
         try:
             _wait_until_healthy(url, process, START_TIMEOUT_S)
         except ServerError as error:
+            if fresh:  # half made, it would end every later server too
+                _stop(process)
+                for part in home.glob(f"{database.name}*"):
+                    part.unlink()
             raise ServerError(f"{error} Its log is {log_path}.") from None
         if template is not None:
-            _save_template(home / "prefect.db", template)
+            _save_template(database, template)
         os.environ["PREFECT_API_URL"] = url
         with _settings_of_environment():
             yield url

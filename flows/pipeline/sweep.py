@@ -13,8 +13,10 @@ from flows.jobs.job import Job, SplitError
 from flows.jobs.request import Request
 from flows.jobs.scene import Scene
 from flows.pipeline.keys import pending
+from flows.pipeline.working_size import with_working_size
 from flows.progress import console
 from schemas.config import SceneSource, SweepConfig, parse_config
+from schemas.documents import write_bytes
 from schemas.errors import ConfigError
 from schemas.settings import merged
 
@@ -59,7 +61,7 @@ def scene_folders(scene: SceneSource) -> list[str]:
 def scene_jobs(config: SweepConfig, scene: SceneSource, source: str, out: Path, problems: list[str]) -> list[Job]:
     """The jobs of one scene; what can't be had is added to `problems`."""
     jobs: list[Job] = []
-    place = Scene(source, scene.reader, scene.image_folder)
+    places: dict[Scene, Scene] = {}  # read once, however many jobs ask
     try:
         for label, settings in config.methods.items():
             for seed in config.seeds:
@@ -68,13 +70,13 @@ def scene_jobs(config: SweepConfig, scene: SceneSource, source: str, out: Path, 
                 for split in config.splits:
                     request = Request(source, out, (split,), run, scene.reader, scene.image_folder)
                     try:
-                        jobs += request.jobs(place)
+                        jobs += request.jobs(places.setdefault(place := request.scene(), place))
                     except SplitError as error:
                         problems.append(str(error))
     except InputError as error:
         problems.append(f"{error} {scene.obtain}".strip())
         return []
-    return jobs
+    return with_working_size(jobs) if jobs else []
 
 
 def open_jobs(jobs: list[Job]) -> list[Job]:
@@ -92,7 +94,7 @@ def run_sweep(config: SweepConfig, out: Path) -> list[str]:
     total, left = sum(map(len, scenes)), sum(map(len, todo))
     console.print(f"{config.name}: {len(scenes)} scenes, {total} runs, of which {left} are to do.")
     out.mkdir(parents=True, exist_ok=True)
-    (out / SWEEP).write_text(json.dumps(config.model_dump(mode="json"), indent=1))
+    write_bytes(out / SWEEP, json.dumps(config.model_dump(mode="json"), indent=1).encode())
     if todo:
         # Only here: importing Prefect would be half the time of a sweep in which nothing is to do.
         from flows.pipeline.server import prefect_server
@@ -100,7 +102,7 @@ def run_sweep(config: SweepConfig, out: Path) -> list[str]:
 
         with prefect_server(out / ".prefect"):
             problems += sweep_flow(config.name, [job for jobs in todo for job in jobs])
-    (out / PROBLEMS).write_text(json.dumps(problems, indent=1))
+    write_bytes(out / PROBLEMS, json.dumps(problems, indent=1).encode())
     page = write_report(out, only_if_changed=not todo)
     console.print(f"Report: {page}")
     return problems

@@ -3,7 +3,7 @@
 A reader is a module of this package with three names:
   LOOKS_FOR: str                      what makes a folder its own, in words (shown when no reader fits);
   detect(path) -> bool                whether the folder is its own, by a look at file names only;
-  read(path, image_folder, view_counts) -> Capture.
+  read(path, image_folder, view_counts) -> Capture; the reader of videos also takes `frames`.
 To add one: write the module, add its name to READERS where it should be tried.
 """
 
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from cat3d_core.cameras import Cameras
 from flows.errors import InputError
-from flows.media.files import list_images
+from flows.media.files import MAX_PIXELS, image_size, list_images
 from flows.names import safe_name, shown, shown_names, source_path
 from flows.readers.sources import scene_of
 
@@ -89,6 +89,16 @@ class Capture:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def size(self, view: int, max_pixels: int = MAX_PIXELS) -> tuple[int, int]:
+        """(width, height) of a view in pixels, by its header alone. Raises InputError as `images.read_image` does."""
+        if self.images is not None:
+            if self.cameras is not None:  # arrays are made when they are asked for
+                width, height = self.cameras.size[view].tolist()
+                return width, height
+            height, width = self.images[view].shape[:2]
+            return width, height
+        return image_size(self.paths[view], max_pixels, self.upright)
 
     def validate(self) -> Capture:
         """Return self, or raise InputError naming the scene and the view that cannot be used."""

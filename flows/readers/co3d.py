@@ -7,7 +7,6 @@ and with x left, y up.
 
 from __future__ import annotations
 
-import gzip
 import json
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import torch
 from torch import Tensor
 
 from flows.errors import InputError
+from flows.media.packed import gunzip
 from flows.readers import splits
 from flows.readers.base import Capture
 from flows.readers.matching import Finder, left_out
@@ -143,8 +143,10 @@ def _ignored(frames: list[dict[str, Any]], category: Path) -> list[str]:
 
 def _annotated_frames(source: Path, sequence: str) -> list[dict[str, Any]]:
     try:
-        content = json.loads(gzip.decompress(source.read_bytes()))
-    except (OSError, EOFError, ValueError) as error:
+        content = json.loads(gunzip(source))
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{source} is not a gzipped JSON file ({error}); download it again.") from None
     frames = [f for f in content if f.get("sequence_name") == sequence]
     if not frames:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cat3d_core.quaternions import unit_rotations
 from flows.errors import InputError
 
 #: Camera models in the order of their numbers in binary files, with the length of their parameters.
@@ -111,16 +112,8 @@ def _pose(quaternion: np.ndarray, translation: np.ndarray, name: str, file: Path
     length = float(np.linalg.norm(quaternion))
     if not length > 1e-9:
         raise InputError(f"{file}: image {name} has a rotation quaternion of length {length:g}; correct it.")
-    w, x, y, z = quaternion / length
     out = torch.eye(4, dtype=torch.float64)
-    out[:3, :3] = torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ],
-        dtype=torch.float64,
-    )
+    out[:3, :3] = unit_rotations(torch.from_numpy(quaternion / length))
     out[:3, 3] = torch.as_tensor(translation)
     return out
 

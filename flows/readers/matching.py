@@ -38,6 +38,7 @@ class Finder:
         self.moved: dict[str, str] = {}
         self._resolved = root.resolve()
         self._listings: dict[Path, dict[str, list[Path]]] = {}
+        self._stems: dict[Path, dict[str, list[Path]]] = {}
 
     def find(self, name: str, folder: str | None = None) -> Path | None:
         """The file of this name, None where there is none.
@@ -131,12 +132,12 @@ class Finder:
         listing, last = self._listing(folder), parts[-1]
         same = [p for p in listing.get(_key(last), []) if p.is_file()]
         exact = [p for p in same if p.name == last]
-        found = next(iter(exact or same), None) or self._with_extension(listing, last)
+        found = next(iter(exact or same), None) or self._with_extension(folder, last)
         return None if found is None else self._checked(found, last)
 
-    def _with_extension(self, listing: dict[str, list[Path]], name: str) -> Path | None:
+    def _with_extension(self, folder: Path, name: str) -> Path | None:
         stems = {_key(name)} | ({_key(Path(name).stem)} if _is_extension(Path(name).suffix) else set())
-        files = [p for paths in listing.values() for p in paths if _key(p.stem) in stems and p.is_file()]
+        files = [p for stem in stems for p in self._stems[folder].get(stem, []) if p.is_file()]
         images = sorted(p for p in files if is_image(p))
         ranked = sorted(images, key=lambda p: (*(p.suffix[1:].lower() != e for e in PREFERRED), p.name))
         return ranked[0] if ranked else None
@@ -144,8 +145,10 @@ class Finder:
     def _listing(self, folder: Path) -> dict[str, list[Path]]:
         if folder not in self._listings:
             listing: dict[str, list[Path]] = {}
+            stems = self._stems[folder] = {}
             for path in sorted(folder.iterdir()) if folder.is_dir() else []:
                 listing.setdefault(_key(path.name), []).append(path)
+                stems.setdefault(_key(path.stem), []).append(path)
             self._listings[folder] = listing
         return self._listings[folder]
 

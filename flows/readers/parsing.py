@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from torch import Tensor
 from cat3d_core.cameras import Cameras, orthonormalize
 from flows.errors import InputError
 from flows.media.files import image_size, list_images, orientation
+from flows.media.packed import check_zip
 from flows.readers.matching import check_link
 
 # Image and calibration may differ in aspect by rounding (3118 x 2078 -> 800 x 533), not by a crop or a turn.
@@ -54,13 +56,18 @@ def load_json(path: Path) -> Any:
         ) from None
     except UnicodeDecodeError:
         raise InputError(f"{path} is not a text file in UTF-8; write it as JSON again.") from None
+    except RecursionError:
+        raise InputError(f"{path} is nested deeper than any description of a scene; correct the file.") from None
+    except ValueError as error:  # such as a number of more than 4,300 digits
+        raise InputError(f"{path} is not valid JSON: {error}; correct the file.") from None
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from None
 
 
 def load_arrays(path: Path, keys: list[str]) -> dict[str, np.ndarray]:
-    """Arrays of an .npz file, never unpickled. InputError for a missing key or a damaged file."""
+    """Arrays of an .npz file (all of them for no `keys`), never unpickled. InputError for a missing key or damage."""
     try:
+        check_zip(path)
         with np.load(path, allow_pickle=False) as archive:
             lacking = [k for k in keys if k not in archive]
             if lacking:
@@ -138,7 +145,7 @@ def cameras_for_files(
     another aspect ratio, and what `Cameras.validate` finds.
     """
     for name, (w0, h0) in zip(names, calibrated_size.tolist(), strict=True):
-        if not (w0 > 0 and h0 > 0):
+        if not (0 < w0 < math.inf and 0 < h0 < math.inf):
             raise InputError(
                 f"{source}: view {name} has an image size of {w0:g} x {h0:g} pixels; both must be positive."
             )
@@ -200,7 +207,7 @@ def _turned(calibrated: Tensor, paths: list[Path], names: list[str], source: Pat
 
 
 def _same_aspect(w: float, h: float, w0: float, h0: float) -> bool:
-    return abs((w / h) / (w0 / h0) - 1) <= ASPECT_TOLERANCE
+    return abs(w * h0 - h * w0) <= ASPECT_TOLERANCE * h * w0
 
 
 def implied_size(

@@ -7,6 +7,7 @@ timestamp, beside the list or in a folder named frames, images, or as the list.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import torch
@@ -32,6 +33,8 @@ def read(path: Path, image_folder: str | None, view_counts: tuple[int, ...]) -> 
         raise InputError(f"{path} has no camera list of RealEstate10K (a .txt with {COLUMNS} numbers a line).")
     rows = _rows(source)
     folder, files = _frames(source, image_folder)
+    if not all(math.isfinite(row[0]) for row in rows):
+        raise InputError(f"{source} has a line whose timestamp is no finite number; mend or remove it.")
     listed = {int(row[0]): row for row in rows}
     if len(listed) != len(rows):
         raise InputError(f"{source} lists a timestamp more than once; keep one line for each frame.")

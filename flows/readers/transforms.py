@@ -23,6 +23,8 @@ from flows.readers.transforms_file import Listing, calibrated_size, lens, load_f
 LOOKS_FOR = "transforms.json, or transforms_train.json (NeRF synthetic)"
 SYNTHETIC_PARTS = ("train", "val", "test")
 ROLES = ("train", "val", "test")
+#: What instant-ngp puts before the names of photos for masks of what moves; white is left out there.
+DYNAMIC = "dynamic_mask_"
 
 
 def detect(path: Path) -> bool:
@@ -82,6 +84,12 @@ def to_capture(path: Path, listing: Listing) -> Capture:
 def _masks(listing: Listing, notes: list[str]) -> list[Path | None]:
     """The frames' mask_path: pixels that are black there are neither trained on nor measured."""
     named = [f.entry.get("mask_path") for f in listing.frames]
+    moving = [f.name for f in listing.frames if (f.path.parent / f"{DYNAMIC}{f.path.stem}.png").is_file()]
+    if moving:
+        notes.append(
+            f"instant-ngp's masks of what moves ({DYNAMIC}NAME.png, of {len(moving)} photos) are not read: give them "
+            "as mask_path of the frames, with black where nothing is to be trained on."
+        )
     if not any(named):
         return []
     found = [listing.finder.find_all([m])[0] if m else None for m in named]
@@ -168,7 +176,7 @@ def _unlisted(path: Path, listing: Listing) -> list[str]:
         return []
     names = [n for n in left_out(folder, [f.path for f in listing.frames], path) if "/" not in n]
     masks = {str(f.entry.get("mask_path", "")).replace("\\", "/").split("/")[-1] for f in listing.frames}
-    names = [n for n in names if n not in masks and "depth" not in n and "normal" not in n]
+    names = [n for n in names if n not in masks and not any(word in n for word in ("depth", "normal", DYNAMIC))]
     return (
         [unlisted_note(len(names), f"photos of the folder {folder.name} that no frame names were", names)]
         if names

@@ -11,6 +11,7 @@ from typing import cast
 
 from cat3d_core.reconstruction import ReconstructionRequest, Reconstructor
 from flows.jobs.job import Job
+from schemas.config import ReconstructConfig
 from schemas.errors import ConfigError
 
 GROUP = "cat3d.reconstructors"
@@ -36,8 +37,19 @@ def open_reconstructor(job: Job) -> Reconstructor:
     request = ReconstructionRequest(
         settings.preset, settings.overrides, job.dataset, job.generates, job.config.skip.model_dump()
     )
+    return _requested(settings.method, request)
+
+
+def view_pixels(settings: ReconstructConfig) -> int | None:
+    """How many pixels of a view the training of a preset can fill, None where the reconstructor does not say. Other
+    settings than the preset make no difference, so that to vary them keeps the photos as they are stored."""
+    made = _requested(settings.method, ReconstructionRequest(settings.preset))
+    return getattr(made, "view_pixels", None)
+
+
+def _requested(method: str, request: ReconstructionRequest) -> Reconstructor:
     try:
-        return reconstructor_class(settings.method).from_request(request)
+        return reconstructor_class(method).from_request(request)
     except ValueError as error:
         raise ConfigError(f"reconstruct.{error}") from None
 

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from cat3d_core.metrics.seeds import Mean
+from flows.reporting.seeds import change
 from flows.reporting.summary import mean, method_order, split_order
 
-#: Mean PSNR closer than this (dB) is called equal: seeds alone move a single scene by more.
+#: Without a second seed, mean PSNR closer than this (dB) is called equal: seeds alone move a single scene by more.
 EQUAL_DB = 0.1
 
 
@@ -26,18 +28,13 @@ class Standing:
 
 @dataclass(frozen=True)
 class Answer:
-    """Methods of one split, the best first, on the same `scenes` scenes; what they were measured on."""
+    """Methods of one split, the best first, on the same `scenes` scenes; `gain_db` of the best over the second, or None
+    where there is nothing to compare with."""
 
     split: str
     scenes: int
     standings: tuple[Standing, ...]
-
-    @property
-    def gain_db(self) -> float | None:
-        """Of the best over the second, or None where there is nothing to compare with."""
-        if len(self.standings) < 2:
-            return None
-        return self.standings[0].psnr_db - self.standings[1].psnr_db
+    gain_db: Mean | None = None
 
     @property
     def sentence(self) -> str:
@@ -47,14 +44,19 @@ class Answer:
         where = "one scene" if self.scenes == 1 else f"{self.scenes} scenes"
         if not others:
             return f"With {which}, {best.method} reaches {best.psnr_db:.2f} dB on {where}{_cost(best)}."
-        second = others[0]
-        if abs(best.psnr_db - second.psnr_db) < EQUAL_DB:
+        second, gain = others[0], self.gain_db or Mean(best.psnr_db - others[0].psnr_db)
+        noise = ""
+        if gain.certain is False:
+            verb = f"{best.method} and {second.method} are equal within the noise of seeds"
+        elif gain.certain is None and abs(gain.value) < EQUAL_DB:
             verb = f"{best.method} and {second.method} are equal"
         else:
-            verb = f"{best.method} beats {second.method} by {best.psnr_db - second.psnr_db:.1f} dB"
+            verb = f"{best.method} beats {second.method} by {gain.text(1)} dB"
+        if gain.certain is None:
+            noise = "; one seed does not say how much of that is noise"
         numbers = f"{best.psnr_db:.2f} against {second.psnr_db:.2f}"
         won = "" if self.scenes == 1 else f", best on {best.best_on} of {self.scenes}"
-        return f"With {which}, {verb} ({numbers} on {where}{won}){_cost(best, second)}."
+        return f"With {which}, {verb} ({numbers} on {where}{won}{noise}){_cost(best, second)}."
 
 
 def _cost(best: Standing, second: Standing | None = None) -> str:
@@ -91,7 +93,9 @@ def answers(rows: Sequence[dict[str, Any]]) -> list[Answer]:
             for method in methods
         ]
         standings.sort(key=lambda s: -s.psnr_db)
-        out.append(Answer(split, len(common), tuple(standings)))
+        first = [[r for r in here if r["method"] == s.method and r["scene_id"] in common] for s in standings[:2]]
+        gain = change(first[0], first[1], "psnr_db") if len(first) == 2 else None
+        out.append(Answer(split, len(common), tuple(standings), gain))
     return out
 
 

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
-from safetensors import safe_open
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.reconstruction import Reconstructor
+from cat3d_core.weights_file import read_weights
 from flows.errors import InputError
 from flows.jobs.access import read_cameras
 from flows.jobs.device import device
@@ -39,36 +38,36 @@ class ShownView:
     anchor: bool = False
 
 
-def captured_views(store: SceneStore, run: Run) -> Iterator[ShownView]:
-    """The captured views whose cameras are known and that the run uses."""
+def captured_views(store: SceneStore, run: Run, pictures: bool = True) -> Iterator[ShownView]:
+    """The captured views whose cameras are known and that the run uses; pictures: with their photos."""
     if "world_from_camera" not in store.captured:
         return
     cameras, names = read_cameras(store.captured), store.captured.read("name")
     registered, roles = store.captured.read("registered"), run.read("role")
     for kind in ("train", "test"):
         for view in np.flatnonzero(registered & (roles == ROLES[kind])).tolist():
-            image = store.captured.read_image("image", view)
+            image = store.captured.read_image("image", view) if pictures else None
             yield ShownView(kind, str(names[view]), view, cameras[view], image)
 
 
-def planned_views(run: Run) -> Iterator[ShownView]:
-    """The plan's views in order; those that are generated with their pictures, without the padding."""
+def planned_views(run: Run, pictures: bool = True) -> Iterator[ShownView]:
+    """The plan's views in order; pictures: those that are generated with their pictures, without the padding."""
     if "plan" not in run or "world_from_camera" not in run.plan:
         return
     cameras, windows, anchors = read_cameras(run.plan), run.plan.read("window"), run.plan.read("anchor")
-    done = generated_count(run)
+    done = pictured(run)
     for view in range(len(cameras)):
         x0, y0, width, height = windows[view].tolist()
-        image = None
-        if len(done) and done[view]:
+        image, made = None, len(done) > 0 and bool(done[view])
+        if made and pictures:
             image = run.generated.read("image", [view])[0, y0 : y0 + height, x0 : x0 + width]
         camera = cameras[view].crop(x0, y0, width, height)
         share = view / max(1, len(cameras) - 1)
-        kind = "planned" if image is None else "generated"
+        kind = "generated" if made else "planned"
         yield ShownView(kind, f"{kind} {view}", view, camera, image, share, bool(anchors[view]))
 
 
-def generated_count(run: Run) -> np.ndarray:
+def pictured(run: Run) -> np.ndarray:
     """(planned views,) bool: which of them have their picture; empty where there are none."""
     if "generated" not in run or "done_image" not in run.generated:
         return np.zeros(0, bool)
@@ -98,7 +97,7 @@ def shape_of(store: SceneStore, run: Run) -> Shape:
         record = store.record(stage, None if stage == "poses" else run.name)
         stages.append((stage, record.key if record else ""))
     path = _checkpoint(store, run)
-    return Shape(tuple(stages), int(generated_count(run).sum()), path.stat().st_mtime if path else 0.0)
+    return Shape(tuple(stages), int(pictured(run).sum()), path.stat().st_mtime if path else 0.0)
 
 
 def _checkpoint(store: SceneStore, run: Run) -> Path | None:
@@ -123,8 +122,7 @@ def reconstruction(store: SceneStore, run: Run) -> Reconstructor | None:
     if not hasattr(kind, "from_state"):
         return None
     try:
-        with safe_open(path, "pt") as file:
-            state: dict[str, torch.Tensor] = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        _, state = read_weights(path)
         return kind.from_state(open_reconstructor(job).settings, state, device())  # type: ignore[no-any-return]
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"The checkpoint {path} cannot be shown: {error}") from None

@@ -1,12 +1,14 @@
 """The report of an output folder: one self-contained HTML page, and the same tables as Markdown.
 
-Everything comes from what runs left behind (stores, Parquet tables); nothing is computed again.
+Everything comes from what runs left behind (stores, Parquet tables). Only the splats of the scene that the page holds
+are made, where none are kept from an earlier page or from the viewer.
 """
 
 from __future__ import annotations
 
 import base64
 import io
+import itertools
 import json
 import re
 from collections import defaultdict
@@ -17,12 +19,15 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, select_autoescape
 
+from flows.disk import naming_full_disk
 from flows.jobs.metric_table import metric_table
 from flows.media.pictures import depth_picture, error_picture
 from flows.reporting.answer import answers, best_runs, rivals
 from flows.reporting.charts import Point, Series, chart
+from flows.reporting.seeds import NOISE, seeds_of
 from flows.reporting.summary import (
     markdown,
+    mean_text,
     method_order,
     method_times,
     missing_networks,
@@ -38,28 +43,38 @@ from flows.reporting.summary import (
 )
 from flows.reporting.turning import PAGE_BYTES, turning_scene
 from flows.stages import STAGES
+from schemas.documents import write_bytes
 from schemas.scene_store import Run, SceneStore
 from schemas.tables import TIMINGS, read_rows
 
 #: Held-out views shown of each run: all of a few, else this many.
 VIEWS_SHOWN = 3
+#: Of the stages in the time chart, in their order.
+COLOURS = ("#8da0cb", "#e78ac3", "#a6d854", "#b15fd6", "#6f7fb5", "#fc8d62", "#ffd92f", "#66c2a5", "#b3b3b3", "#e5c494")
 #: Scenes whose pictures stand at the top of the page, at most.
 SCENES_ON_TOP = 12
 REPORT, SWEEP, PROBLEMS = "report.html", "sweep.json", "problems.json"
 
 
 def write_report(out: Path, only_if_changed: bool = False) -> Path:
-    """Write report.html and report.md of the folder; returns the page. `only_if_changed` keeps a page that exists."""
+    """Write report.html and report.md of the folder; returns the page. `only_if_changed` keeps a page that exists.
+    Raises StoreError naming the disk where that is full."""
     page = out / REPORT
-    if only_if_changed and page.exists():
-        return page
-    scenes = [scene_section(out, path) for path in sorted(out.glob("*.zarr"))]
+    if not (only_if_changed and page.exists()):
+        with naming_full_disk(page):
+            _write(out, page)
+    return page
+
+
+def _write(out: Path, page: Path) -> None:
+    measured = read_rows(out / "metrics", metric_table()).to_pylist()
+    scenes = [scene_section(out, path, measured) for path in sorted(out.glob("*.zarr"))]
     embed_scenes(out, scenes)
     rows, timings = summary_rows(out), timing_rows(out)
     tables = paper_tables(rows)
     sweep = _document(out / SWEEP) or {}
     environment = Environment(loader=PackageLoader("flows.reporting"), autoescape=select_autoescape(["html", "j2"]))
-    environment.filters |= {"fixed": number, "title": title}
+    environment.filters |= {"fixed": number, "mean": mean_text, "title": title}
     published = any(e["published"] for t in tables for d in t["datasets"] for e in d["rows"])
     context = {
         "title": sweep.get("name", out.name),
@@ -72,12 +87,15 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
         "psnr": {(r["scene_id"], r["run"]): r["psnr_db"] for r in rows},
         "tables": tables,
         "published": published,
+        "noise": NOISE,
+        "seeds": seeds_of(rows),
         "paper_metrics": paper_metrics(),
         "shown": shown_metrics(rows),
         "missing": missing_networks(rows),
         "timings": timings,
         "longest": max((t["total"] for t in timings), default=0.0),
         "methods": method_times(timings),
+        "colours": dict(zip((s.name for s in STAGES), itertools.cycle(COLOURS))),
         "stages": [s.name for s in STAGES if any(s.name in t["stages"] for t in timings)],
         "shared": shared_savings(timings),
         "skipped": skipped_work(scenes),
@@ -86,9 +104,9 @@ def write_report(out: Path, only_if_changed: bool = False) -> Path:
         "versions": versions(out, scenes),
         "sweep": sweep,
     }
-    page.write_text(environment.get_template("report.html.j2").render(context), encoding="utf-8")
-    (out / "report.md").write_text(markdown(rows, tables), encoding="utf-8")
-    return page
+    text = environment.get_template("report.html.j2").render(context)
+    write_bytes(out / "report.md", markdown(rows, tables).encode())
+    write_bytes(page, text.encode())  # last, and at once: `only_if_changed` takes a page that is there for a whole one
 
 
 def gallery(scenes: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -110,11 +128,11 @@ def _document(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
 
-def scene_section(out: Path, path: Path) -> dict[str, Any]:
-    """What the page shows of one scene: pictures of some held-out views per run, decisions, versions."""
+def scene_section(out: Path, path: Path, measured: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What the page shows of one scene: pictures of some held-out views per run, decisions, versions. measured: rows
+    of the metrics."""
     store = SceneStore.open(path)
     truths: dict[int, np.ndarray] = {}
-    measured = read_rows(out / "metrics", metric_table()).to_pylist()
     psnr = {(r["run"], r["view"]): r["psnr_db"] for r in reversed(measured) if r["scene_id"] == store.scene_id}
     runs = []
     for name in sorted(store.runs(), key=_run_order):
@@ -135,7 +153,13 @@ def scene_section(out: Path, path: Path) -> dict[str, Any]:
                 "curve": training_curve(run),
             }
         )
-    return {"id": store.scene_id, "dataset": store.dataset, "runs": runs, "provenance": store.attrs["provenance"]}
+    return {
+        "id": store.scene_id,
+        "title": store.captured.attrs.get("title", store.scene_id),
+        "dataset": store.dataset,
+        "runs": runs,
+        "provenance": store.attrs["provenance"],
+    }
 
 
 def embed_scenes(out: Path, scenes: Sequence[dict[str, Any]]) -> None:

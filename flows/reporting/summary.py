@@ -13,9 +13,11 @@ from rich.table import Table
 
 from cat3d_core.metrics import measures
 from cat3d_core.metrics.measures import Metric
+from cat3d_core.metrics.seeds import Mean
 from flows.jobs.metric_table import metric_table
 from flows.progress import console
 from flows.reporting.published import PUBLISHED
+from flows.reporting.seeds import NOISE, change, mean_of, seeds_of
 from flows.stages import STAGES
 from schemas.layout import SCENE_STAGES
 from schemas.tables import TIMINGS, read_rows
@@ -96,9 +98,10 @@ def method_order(method: str) -> tuple[bool, str]:
 def paper_tables(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """The paper's Table 1 for each protocol: {"protocol", "splits", "datasets": [{"name", "rows"}]}.
 
-    A row has "method", "published", "what" (scenes, size, networks) and "cells", one per split: {metric: number} of the
-    paper's metrics, or None; ours are means over scenes and seeds. The paper's rows (its own scenes and sizes) stand
-    above ours, under the protocol `google`, which is the paper's, or else under the first one.
+    A row has "method", "published", "what" (scenes, size, networks), "cells", one per split: {metric: Mean or None} of
+    the paper's metrics, or None, and "noise", one per split: the metrics in which our best method is no better by more
+    than seeds explain. The paper's rows (its own scenes and sizes) stand above ours, under the protocol `google`, which
+    is the paper's, or else under the first one.
     """
     tables = []
     protocols = sorted({r["protocol"] for r in rows}, key=lambda p: (p != "google", p))
@@ -116,25 +119,44 @@ def paper_tables(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             for method in sorted({r["method"] for r in here}, key=method_order):
                 members = [r for r in here if r["method"] == method]
                 entries.append(_entry(method, False, _what(members), members, splits))
+                entries[-1]["noise"] = [_as_good([r for r in here if r["split"] == s], method) for s in splits]
             datasets.append({"name": dataset, "rows": [e for e in entries if any(e["cells"])]})
         tables.append({"protocol": protocol, "splits": splits, "datasets": datasets})
     return tables
 
 
 def _entry(method: str, published: bool, what: str, members: Sequence[dict[str, Any]], splits: Sequence[str]) -> dict:
-    cells = []
+    cells: list[dict[str, Mean | None] | None] = []
     for split in splits:
         found = [m for m in members if m["split"] == split]
-        cells.append({n.name: mean([m[n.name] for m in found]) for n in paper_metrics()} if found else None)
-    return {"method": method, "published": published, "what": what, "cells": cells}
+        if published:  # one number each, whatever it is a mean of
+            cells.append({n.name: Mean(found[0][n.name]) for n in paper_metrics()} if found else None)
+        else:
+            cells.append({n.name: mean_of(found, n.name) for n in paper_metrics()} if found else None)
+    return {"method": method, "published": published, "what": what, "cells": cells, "noise": [set() for _ in splits]}
+
+
+def _as_good(rows: Sequence[dict[str, Any]], method: str) -> set[str]:
+    """The paper's metrics in which the best method of these rows is another one, by no more than seeds explain."""
+    found = set()
+    own = [r for r in rows if r["method"] == method]
+    for metric in paper_metrics():
+        sign = 1 if metric.better == "higher" else -1
+        means = {m: mean_of([r for r in rows if r["method"] == m], metric.name) for m in {r["method"] for r in rows}}
+        known = {m: sign * value.value for m, value in means.items() if value is not None}
+        best = max(known, key=lambda m: known[m], default=method)
+        ahead = change([r for r in rows if r["method"] == best], own, metric.name) if best != method else None
+        if ahead is not None and ahead.value and ahead.certain is False:
+            found.add(metric.name)
+    return found
 
 
 def _what(members: Sequence[dict[str, Any]]) -> str:
-    scenes, seeds = sorted({m["scene_id"] for m in members}), {m["seed"] for m in members}
+    scenes, seeds = sorted({m["scene_id"] for m in members}), seeds_of(members)
     parts = [scenes[0] if len(scenes) == 1 else f"mean of {len(scenes)} scenes"]
     parts += [", ".join(sorted({m["resolution"] for m in members}))]
     parts += ["masked"] if any(m["masked"] for m in members) else []
-    parts += [f"{len(seeds)} seeds"] if len(seeds) > 1 else []
+    parts += [f"{seeds} seeds"] if seeds > 1 else []
     columns = [network.column for network in measures.networks(tuple(paper_metrics()))]
     return " · ".join([*parts, *sorted({m[column] for m in members for column in columns} - {""})])
 
@@ -193,14 +215,15 @@ def markdown(rows: Sequence[dict[str, Any]], tables: Sequence[dict[str, Any]]) -
         columns = ["data set", "method", "what", *(f"{s} views" for s in table["splits"])]
         lines += [
             f"{' / '.join(map(title, paper_metrics()))}, protocol {table['protocol']}. In italics: the paper's, of "
-            "other scenes and sizes, LPIPS by another network.",
+            f"other scenes and sizes, LPIPS by another network. ± is the standard error over seeds; {NOISE} is as "
+            "good as the best of ours within it.",
             "",
             _line(columns),
             "|" + "---|" * len(columns),
         ]
         for dataset in table["datasets"]:
             for e in dataset["rows"]:
-                cells = [" / ".join(_cell(c)) if c else "-" for c in e["cells"]]
+                cells = [" / ".join(_cell(c, n)) if c else "-" for c, n in zip(e["cells"], e["noise"], strict=True)]
                 style = "*" if e["published"] else ""
                 styled = (f"{style}{c}{style}" for c in (e["method"], e["what"], *cells))
                 lines.append(_line([dataset["name"], *styled]))
@@ -215,8 +238,9 @@ def markdown(rows: Sequence[dict[str, Any]], tables: Sequence[dict[str, Any]]) -
     return "\n".join(lines) + "\n"
 
 
-def _cell(row: dict[str, Any]) -> list[str]:
-    return [number(row[metric.name], metric.digits) for metric in paper_metrics()]
+def _cell(row: dict[str, Mean | None], noise: set[str]) -> list[str]:
+    marks = [f" {NOISE}" if metric.name in noise else "" for metric in paper_metrics()]
+    return [mean_text(row[metric.name], metric.digits) + m for metric, m in zip(paper_metrics(), marks, strict=True)]
 
 
 def _line(cells: Sequence[Any]) -> str:
@@ -226,6 +250,11 @@ def _line(cells: Sequence[Any]) -> str:
 def number(value: float | None, digits: int) -> str:
     """A number for a table; a dash for what was not measured."""
     return "-" if value is None else f"{value:.{digits}f}"
+
+
+def mean_text(mean: Mean | None, digits: int) -> str:
+    """A mean for a table, with its error where that is known; a dash for what was not measured."""
+    return "-" if mean is None else mean.text(digits)
 
 
 def print_metrics(out: Path, scene_id: str) -> None:

@@ -21,7 +21,7 @@ from flows.exports.splat_files import write_splat
 from flows.exports.splats import splats_of
 from flows.jobs.access import read_cameras
 from flows.reconstruction.stored import read_reconstruction
-from flows.reporting.content import ShownView, captured_views, planned_views
+from flows.reporting.content import ShownView, captured_views, planned_views, scene_points
 from schemas.errors import StoreError
 from schemas.scene_store import Run, SceneStore, Section
 
@@ -33,14 +33,15 @@ STEPS, SIDE = 100, 160
 """Splats are made of the stored renders with the longer side at most SIDE pixels, and refined in STEPS steps: some
 seconds."""
 COLOURS = {"train": (0.84, 0.15, 0.16), "test": (0.12, 0.47, 0.71), "generated": (0.17, 0.63, 0.17)}
-CAMERAS = 60
-"""Cameras of each kind that are drawn, at most."""
+CAMERAS, POINTS = 60, 3000
+"""Cameras of each kind, and sparse points, that are drawn, at most."""
 
 
 def turning_scene(store: SceneStore, run: Run, room: int) -> dict[str, Any] | None:
     """What the page embeds of a run, or a sentence on why it does not; None where there is no reconstruction yet.
 
-    room: bytes that are left. Keys: "splats" (base64 of a .splat file) and "cameras" (JSON), or "left_out".
+    room: bytes that are left. Keys: "splats" (base64 of a .splat file), "cameras" (JSON, with the sparse points),
+    "count" (of splats) and "bytes", or "left_out".
     """
     if store.record("reconstruct", run.name) is None:
         return None
@@ -54,7 +55,10 @@ def turning_scene(store: SceneStore, run: Run, room: int) -> dict[str, Any] | No
         file = Path(folder) / "scene.splat"
         write_splat(file, splats)
         encoded = base64.b64encode(file.read_bytes()).decode()
-    cameras = json.dumps(camera_rows([*captured_views(store, run), *planned_views(run)]))
+    points = scene_points(store)
+    points = points[np.unique(np.linspace(0, len(points) - 1, min(POINTS, len(points))).round().astype(int))]
+    rows = camera_rows([*captured_views(store, run, pictures=False), *planned_views(run, pictures=False)])
+    cameras = json.dumps({"cameras": rows, "points": np.round(points.astype(float), 3).tolist()})
     size = len(encoded) + len(cameras)
     if size > room:
         return {

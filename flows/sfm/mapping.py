@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -69,6 +70,12 @@ class Attempt:
         return self.placed == count
 
 
+def decoded(photos: Sequence[Path | str] | Sequence[np.ndarray]) -> bool:
+    """Whether the photos are pixels and not files. Frames of a video are decoded as they are asked for, so only files,
+    which come in a list, are looked at."""
+    return not isinstance(photos, list | tuple) or isinstance(photos[0], np.ndarray)
+
+
 class Mapper:
     """The steps of one estimate; files live in `folder`, images are called by their index."""
 
@@ -88,7 +95,8 @@ class Mapper:
     def extract(self, photos: Sequence[Path | str] | Sequence[np.ndarray], masks: Sequence[Path | None]) -> None:
         """Decode, shrink, and find SIFT keypoints; one camera for all where sizes and EXIF focal lengths agree."""
         start = time.perf_counter()
-        focals = [None if isinstance(p, np.ndarray) else exif_focal_px(p) for p in photos]
+        files: Sequence[Any] = [] if decoded(photos) else photos
+        focals: list[float | None] = [exif_focal_px(path) for path in files] or [None] * len(photos)
         for i, photo in enumerate(photos):
             image = photo if isinstance(photo, np.ndarray) else read_image(photo)[0]
             height, width = image.shape[:2]

@@ -24,7 +24,7 @@ from flows.media.images import read_image
 from flows.readers.lenses import lens_of
 from flows.readers.parsing import from_camera_from_world, pinhole
 from flows.sfm.colmap import pycolmap
-from flows.sfm.mapping import FROM_EXIF, Attempt, Mapper, PoseSettings, Progress, image_index
+from flows.sfm.mapping import FROM_EXIF, Attempt, Mapper, PoseSettings, Progress, decoded, image_index
 
 DEFAULT_FOV_DEGREES = 60.0
 
@@ -90,7 +90,7 @@ def estimate_poses(
         raise InputError("There are no photos to estimate poses for; give at least one.")
     if masks and len(masks) != len(photos):
         raise InputError(f"There are {len(photos)} photos but {len(masks)} masks; give one, or None, for each.")
-    names = [f"photo {i}" if isinstance(p, np.ndarray) else Path(p).name for i, p in enumerate(photos)]
+    names = [f"photo {i}" for i in range(len(photos))] if decoded(photos) else [Path(p).name for p in photos]  # type: ignore[arg-type]
     progress = on_progress or (lambda step, done, total: None)
     if len(photos) == 1:
         return _single_image(photos[0], names)

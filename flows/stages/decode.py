@@ -44,7 +44,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     generated.create_array("done_image", (views, 32))
     if job.hinted:
         generated.create_array("confidence", (views, height, width))
-    explained = explained_views(store.run(job.run))
+    explained = explained_views(job, store.run(job.run))
     wanted = np.flatnonzero(generated.read("done_latent").any(-1) | explained).tolist()
     left_out = sorted(set(range(views)) - set(wanted))
     generated.mark_skipped("done_image", left_out)
@@ -83,7 +83,7 @@ def work(job: Job, store: SceneStore, key: str, items: Sequence[int]) -> None:
     generated = run.generated
     generator = open_generator(job)
     keys = view_keys(key, generated.shape("latent")[0])
-    explained = explained_views(run)
+    explained = explained_views(job, run)
     for view in items:
         if is_done(generated, "done_image", view, keys[view], "image"):
             continue

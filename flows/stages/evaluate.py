@@ -77,7 +77,8 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
         decisions.append(skipped("This run has no rendered held-out views: there is nothing to compare."))
     decisions += text_scores(job, store)
     append_rows(job.results_path / "metrics", metric_table(), rows, f"{job.scene_id}.{job.run}")
-    return Outcome({"views": len(test)}, decisions)
+    pixels = int(store.captured.read("size", test).astype(np.int64).prod(1).sum()) if test else 0
+    return Outcome({"views": len(test), "pixels": pixels}, decisions)
 
 
 def text_scores(job: Job, store: SceneStore) -> list[Decision]:
@@ -92,7 +93,7 @@ def text_scores(job: Job, store: SceneStore) -> list[Decision]:
     photo = store.captured.read_image("image", 0)
     embedded = torch.cat([tower(_image(np.asarray(frame))[None]) for frame in frames])
     by_photo = float((embedded @ tower(_image(photo)[None])[0]).mean())
-    said = f"{len(frames)} frames of the video by {tower.name}: CLIP score {by_photo:.3f} with the photo"
+    said = f"{len(embedded)} frames of the video by {tower.name}: CLIP score {by_photo:.3f} with the photo"
     text = text_embedding(made_from["text"])
     if text is None:
         return [chosen(f"{said}; none with the text (its tower and tokenizer, or transformers, are missing).")]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -18,9 +19,12 @@ from flows.media import images
 from flows.progress import console, meter
 from flows.readers.base import Capture
 from flows.sfm.consistency import check_consistency
-from schemas.config import IngestConfig
+from schemas.config import IngestConfig, RunConfig
 from schemas.decisions import chosen, warning
 from schemas.scene_store import SceneStore
+
+#: Views that are made ahead of what is written, at most.
+CHUNK = 4
 
 
 class Ingested(NamedTuple):
@@ -42,49 +46,73 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     """Write `captured/`: image, size, name, source_sha256, and mask and intrinsics where the data set has them."""
     capture = job.capture()
     count = len(capture)
-    with meter(f"ingest {job.scene_id}", count) as progress, ThreadPoolExecutor(2) as pool:
+    store.captured.set_attrs(made_from=capture.made_from)
+    with meter(f"ingest {job.scene_id}", count) as progress:
 
         def one(view: int) -> Ingested:
             out = ingest_view(capture, view, job.config.ingest)
             progress.advance(note=capture.names[view])
             return out
 
-        views = list(pool.map(one, range(count)))
-    store.captured.set_attrs(made_from=capture.made_from)
-    write_captured(store, capture, job.scene.digests["images"], views)
+        pixels = write_captured(store, capture, job, in_chunks(one, count))
+    read = sum(math.prod(capture.size(view)) for view in range(count))
     decisions = [warning(note) for note in capture.notes]
+    if job.working_size:
+        decisions.append(chosen(job.working_size))
     if capture.distortion is not None:
         decisions.append(chosen("The images were undistorted; the stored intrinsics are those of the pinhole images."))
     if capture.paths and job.config.ingest.check_cameras:
         with console.status(f"Checking the cameras of {job.scene_id}"):
             decisions += [warning(text) for text in check_consistency(capture)]
-    pixels = sum(v.image.shape[0] * v.image.shape[1] for v in views)
-    return Outcome({"views": count, "pixels": pixels}, decisions)
+    return Outcome({"views": count, "pixels": pixels, "pixels_read": read}, decisions)
 
 
-def write_captured(store: SceneStore, capture: Capture, digests: dict[str, str], views: list[Ingested]) -> None:
-    """Write all views' images (padded to the largest), sizes, names and digests, and K where it is known."""
+def in_chunks(one: Callable[[int], Ingested], count: int) -> Iterator[Ingested]:
+    """one(view) of all views in order, made by two threads, at most CHUNK of them ahead of what was taken."""
+    with ThreadPoolExecutor(2) as pool:
+        for first in range(0, count, CHUNK):
+            yield from pool.map(one, range(first, min(first + CHUNK, count)))
+
+
+def write_captured(store: SceneStore, capture: Capture, job: Job, views: Iterable[Ingested]) -> int:
+    """Write all views' images (padded to the largest), sizes, names and digests, and K where it is known, a view at a
+    time; how many pixels they are."""
     captured = store.captured
-    sizes = np.array([[v.image.shape[1], v.image.shape[0]] for v in views], np.int32)
+    sizes = np.array([stored_size(capture, view, job.config.ingest) for view in range(len(capture))], np.int32)
     width, height = sizes.max(0)
+    captured.set_attrs(title=capture.title, mask_training=capture.mask_training)
     captured.write("size", sizes)
     captured.write("name", np.array(capture.names, dtype=object))
-    captured.write("source_sha256", np.array(list(digests.values()), dtype=object))
-    captured.create_array("image", (len(views), height, width, 3))
-    captured.write_images("image", [v.image for v in views], range(len(views)))
-    masks = [v.mask for v in views]
-    captured.set_attrs(title=capture.title, mask_training=capture.mask_training)
-    if any(m is not None for m in masks):
-        captured.create_array("mask", (len(views), height, width))
-        full = [np.full(v.image.shape[:2], 255, np.uint8) if v.mask is None else v.mask for v in views]
-        captured.write_images("mask", full, range(len(views)))
-    else:
+    captured.write("source_sha256", np.array(list(job.scene.digests["images"].values()), dtype=object))
+    captured.create_array("image", (len(sizes), height, width, 3))
+    known, unmasked, masked = [], [], False
+    for view, one in enumerate(views):
+        captured.write_images("image", [one.image], [view])
+        if one.intrinsics is not None:
+            known.append(one.intrinsics)
+        if one.mask is None:
+            unmasked.append(view)
+            continue
+        if not masked:
+            captured.create_array("mask", (len(sizes), height, width))
+            masked = True
+        captured.write_images("mask", [one.mask], [view])
+    for view in unmasked if masked else ():
+        captured.write_images("mask", [np.full(sizes[view][::-1], 255, np.uint8)], [view])
+    if not masked:
         captured.remove("mask")
-    known = [v.intrinsics for v in views if v.intrinsics is not None]
-    if len(known) == len(views):
+    if len(known) == len(sizes):
         captured.write("intrinsics", torch.stack(known).numpy())
     else:
         captured.remove("intrinsics")
+    return int(sizes.astype(np.int64).prod(1).sum())
+
+
+def stored_size(capture: Capture, view: int, settings: IngestConfig) -> tuple[int, int]:
+    """(width, height) that a view has in the store."""
+    width, height = capture.size(view, settings.max_pixels)
+    scale = settings.downscale or 1.0
+    return max(1, round(width / scale)), max(1, round(height / scale))
 
 
 def ingest_view(
@@ -132,7 +160,7 @@ def ingest_view(
         if mask is not None:
             mask, _ = images.undistort(mask, original, distortion, nearest=True, fisheye=fisheye)
         camera = Cameras(intrinsics[None], camera.world_from_camera, camera.size)
-    small_width, small_height = (max(1, round(side / settings.downscale)) for side in (width, height))
+    small_width, small_height = stored_size(capture, view, settings)
     image = images.resize(image, small_width, small_height)
     if mask is not None:
         mask = images.resize(mask, small_width, small_height)
@@ -141,5 +169,13 @@ def ingest_view(
 
 
 # The digests of a video's frames cover which those are, and the check only warns.
-SETTINGS = settings_of("ingest", without=("frames", "check_cameras"))
-STAGE = Stage("ingest", execute, version=1, settings=SETTINGS, inputs=inputs)
+_given = settings_of("ingest", without=("frames", "check_cameras"))
+
+
+def ingest_settings(config: RunConfig) -> dict[str, Any]:
+    """The settings; photos of which no size was chosen are taken whole."""
+    given = _given(config)
+    return given | {"downscale": given["downscale"] or 1.0}
+
+
+STAGE = Stage("ingest", execute, version=1, settings=ingest_settings, inputs=inputs)

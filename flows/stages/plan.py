@@ -15,6 +15,7 @@ from flows.jobs.access import read_cameras, views_with_role
 from flows.jobs.job import Job, Outcome
 from flows.jobs.stage import Stage, generates, settings_of
 from schemas.decisions import chosen, skipped
+from schemas.documents import write_bytes
 from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
 
@@ -48,7 +49,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
 
     job.pictures.mkdir(parents=True, exist_ok=True)
     picture = draw_plan(read_cameras(store.captured, train), plan, _points(store), f"{job.scene_id} {job.run}")
-    (job.pictures / "plan.png").write_bytes(picture)
+    write_bytes(job.pictures / "plan.png", picture)
     anchors = sum(len(group.targets) for group in plan.groups if group.anchors)
     summary = f"{len(plan)} views of the trajectory {plan.recipe} in {len(plan.groups)} groups"
     decisions = [chosen(f"{summary}, {anchors} of them anchors." if anchors else f"{summary}.")]

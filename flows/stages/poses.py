@@ -15,11 +15,10 @@ from cat3d_core.normalization import Similarity, normalize_scene
 from flows.jobs.access import write_cameras
 from flows.jobs.job import Job, Outcome
 from flows.jobs.stage import Stage, settings_of
-from flows.media.files import image_size
 from flows.progress import Meter, meter
 from flows.readers.base import Capture
 from flows.sfm.poses import PoseSettings, estimate_poses
-from flows.stages.ingest import ingest_view, write_captured
+from flows.stages.ingest import Ingested, in_chunks, ingest_view, write_captured
 from schemas.decisions import Decision, chosen, skipped
 from schemas.scene_store import SceneStore
 
@@ -85,19 +84,16 @@ def _estimate(
     registered = np.zeros(len(capture), bool)
     registered[result.registered] = True
     row = {view: i for i, view in enumerate(result.registered)}
-    views = []
-    for view in range(len(capture)):
+
+    def one(view: int) -> Ingested:
         i = row.get(view, 0)
         camera = result.cameras[i]
         lens = result.distortion[i] if result.distortion is not None and view in row else None
         if view not in row:  # an unplaced photo may have another size; its camera is a stand-in of the right shape
-            if capture.images is not None:
-                height, width = capture.images[view].shape[:2]
-            else:
-                width, height = image_size(capture.paths[view], upright=capture.upright)
-            camera = camera.resize(width, height)
-        views.append(ingest_view(capture, view, job.config.ingest, lens, camera))
-    write_captured(store, capture, job.scene.digests["images"], views)
+            camera = camera.resize(*capture.size(view))
+        return ingest_view(capture, view, job.config.ingest, lens, camera)
+
+    write_captured(store, capture, job, in_chunks(one, len(capture)))
     size = torch.from_numpy(store.captured.read("size").astype(np.int64))
     poses = torch.stack([result.cameras.world_from_camera[row.get(v, 0)] for v in range(len(capture))])
     intrinsics = torch.from_numpy(store.captured.read("intrinsics"))

@@ -15,7 +15,7 @@ from flows.jobs.stage import Stage, settings_of
 from flows.progress import meter
 from flows.reconstruction.open import open_reconstructor
 from flows.reconstruction.stored import Checkpoint, write_reconstruction
-from flows.stages.training_views import training_views
+from flows.stages.training_views import enough, training_views
 from schemas.decisions import Decision, skipped
 from schemas.scene_store import SceneStore
 
@@ -28,7 +28,11 @@ def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
     """The training views, the reconstructor's settings in full, and what decides which pixels are trained on: a changed
     preset or rule makes old fields stale."""
     skip = job.config.skip
-    found = {"train": job.view_names("train"), "detail": skip.detail, "seen": skip.seen}
+    train = job.view_names("train")
+    bound = enough(len(train)) if skip.seen and job.generates else None
+    found: dict[str, Any] = {"train": train, "detail": skip.detail, "seen": bound or skip.seen}
+    if job.generates and skip.seen and job.capture().mask_training:
+        found["masks"] = True  # the brief field heeds them
     return found | dict(open_reconstructor(job).settings)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -26,6 +27,8 @@ from schemas.scene_store import Run, SceneStore, Section
 
 #: Raised when the same field and cameras give other pictures.
 VERSION = 1
+#: Depths of a video that its range of colours is found from, at most.
+DEPTHS = 20_000_000
 
 
 def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
@@ -77,7 +80,7 @@ def render_views(
     section.write("view", np.array(views, np.int32))
     parts = zip(views, cameras.intrinsics, cameras.world_from_camera, cameras.size, strict=True)
     keys = [content_key(step=key, view=view, camera=[array_digest(part.numpy()) for part in c]) for view, *c in parts]
-    done = section.done("done", keys, data=["image", "depth"])
+    done = section.done("done", keys, data=["image", "depth", "opacity"])
     rays = []
     for i in range(len(cameras)):
         if done[i]:
@@ -129,7 +132,9 @@ def write_pictures(job: Job, run: Run, test: list[int]) -> None:
 
 def _depth_range(section: Section) -> tuple[float, float]:
     """One range for the whole video, so that colours do not flicker."""
-    depth = section.read("depth")
+    frames, *size = section.shape("depth")
+    step = max(1, math.isqrt(frames * math.prod(size) // DEPTHS))
+    depth = np.stack([section.read("depth", [i])[0, ::step, ::step] for i in range(frames)])
     inside = depth[depth > 0]
     return tuple(np.quantile(inside, [0.01, 0.95]).tolist()) if inside.size else (0.1, 1.0)
 

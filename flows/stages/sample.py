@@ -36,7 +36,10 @@ NEEDS = Needs(gpu=True, memory_gb=1.5)
 
 def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
     """The generator, the sampler it is used with, and how the views are chosen."""
-    return {"model": generator_spec(job).identity, "sampler": sampler_settings(job), "rounds": job.config.skip.rounds}
+    rounds = job.config.skip.rounds
+    found = {"model": generator_spec(job).identity, "sampler": sampler_settings(job), "rounds": rounds}
+    # Brief fields heed masks since there are some to train by.
+    return found | ({"masks": True} if rounds and job.capture().mask_training else {})
 
 
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
@@ -48,7 +51,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     run = store.run(job.run)
     run.generated.set_attrs(terms=generator_spec(job).terms)
     plan = StoredPlan(store, run, job.config.seed)
-    explained = explained_views(run)
+    explained = explained_views(job, run)
     rounds = Rounds(job, store, plan, sampling_flops(job, plan)) if job.config.skip.rounds else OneRound(plan)
     totals, groups, spared = Totals(), [], set(range(len(plan.groups)))
     for planned in rounds:
@@ -149,7 +152,7 @@ def sampler_decisions(job: Job, plan: StoredPlan, groups: Sequence[int]) -> list
 def work(job: Job, store: SceneStore, key: str, items: Sequence[int]) -> None:
     """A worker's share: sample the groups `items`, in order, and store the views of each as soon as they are there."""
     run = store.run(job.run)
-    plan = StoredPlan(store, run, job.config.seed)
+    plan = StoredPlan(store, run, job.config.seed, job.hinted)
     keys = view_keys(key, len(plan))
     generator = open_generator(job)
     targets = [view for g in items for view in plan.groups[g].targets]
@@ -173,7 +176,8 @@ STAGE = Stage(
     execute,
     version=1,
     reads=("plan", "match", "encode"),
-    settings=settings_of("sample", "seed", without=("generator", "checkpoint")),  # its identity is among the inputs
+    # The generator's identity is among the inputs, and so is the start.
+    settings=settings_of("sample", "seed", without=("generator", "checkpoint", "start")),
     inputs=inputs,
     wanted=samples,
     needs=NEEDS,

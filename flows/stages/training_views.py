@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from itertools import chain
 
 import torch
 from torch.nn import functional
@@ -18,12 +19,22 @@ from flows.media.images import resize
 from schemas.decisions import Decision, chosen, skipped
 from schemas.scene_store import Run, SceneStore
 
+#: Share of the pixels of generated views that captured ones show as well from which on none is trained on. Measured on
+#: the procedural sweep: below 0.4 they gain 1 to 8 dB, from 0.5 on -0.5 to 0.1 (docs/log/2026-11-28_hints.md).
+ENOUGH = 0.5
+#: Up to so many captured views generated ones are always trained on: what two of so few show, they show badly.
+FEW = 3
+
+
+def enough(captured: int) -> float | None:
+    """ENOUGH where that rule holds for so many captured views, else None."""
+    return ENOUGH if captured > FEW else None
+
 
 def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[Decision]]:
     """The run's training views: captured ones, and the generated ones where the run has them; what was decided."""
     train = views_with_role(store, run, "train")
     cameras = read_cameras(store.captured, train)
-    images = read_images(store.captured, train)
     decisions, made = [], []
     if not job.generates:
         decisions.append(chosen("No views were generated: method zipnerf trains on captured views alone."))
@@ -41,7 +52,6 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
                 pixels = sum(a.numel() - b.numel() for a, b in reduced) // 3
                 decisions.append(skipped(text, "detail", pixels=pixels))
         cameras = Cameras.cat([cameras, *(view.camera for view in made)])
-        images += [view.image for view in made]
         if not made:
             text = "Trained on captured views alone, without the LPIPS loss: no view was generated."
             decisions.append(skipped(text))
@@ -51,8 +61,16 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
         masks += [None] * (len(cameras) - len(train))
         decisions.append(skipped("Pixels outside the masks of captured views were not trained on."))
     maps = hint_maps(len(train), made)
-    views, more = unseen_alone(job, Views.from_images(cameras, images, captured, masks, **maps))
-    return views, decisions + more
+    images = chain(read_images(store.captured, train), (view.image for view in made))
+    views = Views.from_images(cameras, images, captured, masks, **maps)
+    kept, told = unseen(job, views)
+    if told is None:
+        return views, decisions
+    if kept is not None:
+        return views.only(kept), [*decisions, told]
+    known, photos = slice(0, len(train)), read_images(store.captured, train)
+    alone = Views.from_images(cameras[known], photos, captured[known], None if masks is None else masks[known])
+    return alone, [*decisions, told]
 
 
 def hint_maps(captured: int, made: Sequence[GeneratedView]) -> dict[str, list[torch.Tensor | None]]:
@@ -82,17 +100,22 @@ def no_finer(view: GeneratedView, focal: float) -> GeneratedView:
     )
 
 
-def unseen_alone(job: Job, views: Views) -> tuple[Views, list[Decision]]:
-    """The views without those pixels of generated ones that two captured ones show as well, and what was decided."""
+def unseen(job: Job, views: Views) -> tuple[torch.Tensor | None, Decision | None]:
+    """Which pixels of the views (P,) bool are trained on: not those of generated ones that two captured ones show as
+    well; None for captured views alone, where that is most of the pixels. And what was decided, if anything was."""
     captured = int(views.captured.sum())
     if not job.config.skip.seen or captured == len(views) or captured < LEAST:
-        return views, []
+        return None, None
     started = time.monotonic()
     shown = shown_by_captured(job, views)
-    share = float(shown.sum() / views.size[~views.captured].prod(-1).sum())
-    text = (
-        f"{share:.0%} of the pixels of generated views were not trained on: {LEAST} captured views show their places "
-        f"too, by a brief reconstruction of those views ({time.monotonic() - started:.0f} s). They get at least that "
-        "share of the rays."
-    )
-    return views.only(~shown), [skipped(text, "seen", pixels=int(shown.sum()))]
+    pixels = int(views.size[~views.captured].prod(-1).sum())
+    share = float(shown.sum()) / pixels
+    says = f"too, by a brief reconstruction of those views ({time.monotonic() - started:.0f} s)."
+    bound = enough(captured)
+    if bound is not None and share >= bound:
+        text = f"No generated view was trained on: {LEAST} captured views show the places of {share:.0%} of their "
+        text += f"pixels {says} The rest would cost more than it gives."
+        return None, skipped(text, "seen", pixels=pixels)
+    text = f"{share:.0%} of the pixels of generated views were not trained on: {LEAST} captured views show their "
+    text += f"places {says} They get at least that share of the rays."
+    return ~shown, skipped(text, "seen", pixels=int(shown.sum()))

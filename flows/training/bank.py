@@ -10,6 +10,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from cat3d_core.diffusion import Autoencoder, LatentBank
+from cat3d_core.diffusion.hints import rescaled
 from flows.training.renders import as_tensors, save, shards, variants
 
 
@@ -43,9 +44,12 @@ def load_bank(folder: Path, image_size: int) -> LatentBank:
     return LatentBank(**{name: torch.cat([p[name] for p in parts]) for name in parts[0]}, image_size=image_size)
 
 
-def jitter_scale(cameras: Tensor, most: float, random: torch.Generator) -> Tensor:
-    """Scale the positions of each group's cameras [G, V, 4, 4] by a number from 1 / most to most."""
+def jitter_scale(
+    cameras: Tensor, most: float, random: torch.Generator, hints: Tensor | None = None
+) -> tuple[Tensor, Tensor | None]:
+    """Scale each group's scene by a number from 1 / most to most: the positions of its cameras [G, V, 4, 4], and the
+    inverse depths of its hints."""
     factor = most ** (2 * torch.rand(len(cameras), 1, 1, generator=random) - 1)
     scaled = cameras.clone()
     scaled[:, :, :3, 3] *= factor
-    return scaled
+    return scaled, None if hints is None else rescaled(hints, factor.flatten())

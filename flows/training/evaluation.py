@@ -41,6 +41,7 @@ from flows.generation.formats import cat3d
 from flows.jobs.device import exact_device
 from flows.media.images import read_image, square_image, write_png
 from flows.readers.base import read_capture
+from flows.training.hint_bank import told
 from flows.training.worlds.held_out import HeldOutWorld, held_out_worlds
 
 CAPTURED = ("llff_fern", "dtu_scan24", "co3d_apple", "re10k_bedroom", "mipnerf360_bonsai", "fox")
@@ -63,7 +64,10 @@ def captured_group(scene: Path, size: int, given: int, views: int = 8) -> tuple[
     chosen = [*split["train"], *(test[row] for row in rows)]
     cameras = normalize_scene(capture.cameras, capture.points, capture.depth_bounds).cameras(capture.cameras)[chosen]
     boxes = source_boxes(cameras.size, "square").tolist()
-    squares = [square_image(read_image(capture.paths[i])[0], box, size) for i, box in zip(chosen, boxes, strict=True)]
+    squares = [
+        square_image(read_image(capture.paths[i], upright=capture.upright)[0], box, size)
+        for i, box in zip(chosen, boxes, strict=True)
+    ]
     images = torch.stack([torch.from_numpy(square).permute(2, 0, 1).float() / 255 for square in squares])
     return images, sample_cameras(cameras, "square", size)
 
@@ -79,11 +83,12 @@ def evaluate_group(
     generator: Generator, image: Tensor, cameras: Cameras, given: int, sampler: SamplerConfig, key: tuple
 ) -> dict[str, Tensor]:
     """Images (N - given, 3, H, W) of each method but `warp`, and `truth`; image (N, 3, H, W), the first `given`
-    given."""
+    given. A model that takes hints is given the shipped plane sweep's."""
     shape, truth = generator.spec.latent_shape, image[given:]
     (made,) = generate(
-        generator, [(image[:given], cameras)], sampler, lambda _, view: normal(shape, 0, *key, view, "noise")
-    )
+        generator, [(image[:given], cameras)], sampler, lambda _, view: normal(shape, 0, *key, view, "noise"),
+        [told(generator, image[:given], cameras)],
+    )  # fmt: skip
     nearest = image[camera_distance(cameras)[given:, :given].argmin(1)]
     return {"sample": made, "nearest": nearest, "autoencoder": generator.decode(generator.encode(truth)),
             "truth": truth}  # fmt: skip

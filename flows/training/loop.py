@@ -18,6 +18,7 @@ from cat3d_core.diffusion import (
     save_model,
     save_state,
 )  # fmt: skip
+from cat3d_core.diffusion.hint_bank import HintBank
 from cat3d_core.diffusion.training import half_cosine
 from cat3d_core.generation import Cat3dGenerator
 from cat3d_core.random import generator
@@ -46,7 +47,8 @@ def train_config(config: TrainRunConfig) -> TrainConfig:
     return TrainConfig(
         learning_rate=o.learning_rate, final_learning_rate=o.learning_rate, warmup_steps=o.warmup_steps,
         weight_decay=o.weight_decay, clip_norm=o.clip_norm, ema_decay=o.ema_decay, accumulate=o.accumulate,
-        drop_probability=o.drop_probability, drop=o.drop, min_snr_gamma=o.min_snr_gamma, precision=o.precision,
+        drop_probability=o.drop_probability, drop=o.drop, hint_weight=o.hint_weight,
+        min_snr_gamma=o.min_snr_gamma, precision=o.precision,
     )  # fmt: skip
 
 
@@ -71,18 +73,21 @@ def spread_at(config: TrainRunConfig, done: float) -> float:
 
 
 def optimizer_step(
-    trainer: Trainer, config: TrainRunConfig, bank: LatentBank, ranks: Ranks, done: float
+    trainer: Trainer, config: TrainRunConfig, bank: LatentBank | HintBank, ranks: Ranks, done: float
 ) -> dict[str, float]:
     """All evaluations of one optimizer step; what is drawn depends on seed, evaluation and rank alone."""
-    losses, record, views = [], {}, config.model.views
+    losses, record, views, groups = [], {}, config.model.views, config.optimizer.groups
     for _ in range(config.optimizer.accumulate):
-        key = (trainer.calls, ranks.rank)
-        latents, cameras = bank.batch(
-            config.optimizer.groups, views, config.seed, *key, spread=spread_at(config, done)
-        )  # fmt: skip
-        cameras = jitter_scale(cameras, config.scale_jitter, generator(config.seed, "jitter", *key))
+        key, hints = (trainer.calls, ranks.rank), None
         modes = config.conditions if done >= config.joint_from else config.conditions[:1]
-        record = trainer.step(latents, cameras, modes[trainer.calls % len(modes)])
+        given = modes[trainer.calls % len(modes)]
+        if isinstance(bank, HintBank):
+            latents, cameras, hints = bank.batch(groups, given, config.seed, *key)
+        else:
+            latents, cameras = bank.batch(groups, views, config.seed, *key, spread=spread_at(config, done))
+        jitter = generator(config.seed, "jitter", *key)
+        cameras, hints = jitter_scale(cameras, config.scale_jitter, jitter, hints)
+        record = trainer.step(latents, cameras, given, hints)
         losses.append(record["loss"])
     return record | {"loss": sum(losses) / len(losses)}
 
@@ -91,7 +96,7 @@ def train(
     config: TrainRunConfig,
     folder: Path,
     model: MultiViewModel,
-    bank: LatentBank,
+    bank: LatentBank | HintBank,
     scenes: HeldOut,
     ranks: Ranks,
     provenance: dict[str, Any],

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from cat3d_core.diffusion import SIZES, Autoencoder, ModelConfig, MultiViewModel, describe, load_model
+from cat3d_core.diffusion import SIZES, Autoencoder, ModelConfig, MultiViewModel, UNetConfig, describe, load_model
 from cat3d_core.diffusion.config import from_dict
 from cat3d_core.diffusion.pretrained import load_stable_diffusion
 from flows.generation.formats.cat3d import recognises
@@ -41,6 +41,8 @@ def starting_config(config: ModelConfig, start: Path | None) -> ModelConfig:
         theirs = load_model(start).config
         # These have no weights: a network may take up relative cameras or larger images in the middle of its training.
         free = {name: getattr(config.unet, name) for name in ("relative_cameras", "latent_size")}
+        if not theirs.unet.hints:  # the channels for them start as zero
+            free["hints"] = config.unet.hints
         if dataclasses.replace(theirs.unet, **free) != config.unet:
             raise ValueError(f"{start} holds another U-Net than the one asked for: {_differences(theirs, config)}.")
         return config
@@ -56,7 +58,7 @@ def starting_model(config: ModelConfig, autoencoder: Autoencoder, start: Path | 
         # No pretrained network has to be kept as it is: let the rays in from the first step.
         torch.nn.init.kaiming_uniform_(model.unet.conv_in.weight, a=5**0.5)
     elif recognises(start):
-        model.unet.load_state_dict(load_model(start).unet.state_dict())
+        model.unet.load_state_dict(_with_hints(load_model(start).unet.state_dict(), config.unet))
     else:
         model.unet = _from_stable_diffusion(start, config)[0]
     return model
@@ -71,9 +73,16 @@ def history(start: Path) -> dict[str, Any]:
     return {"sha256": facts.get("sha256")} | {k: facts["provenance"][k] for k in kept if k in facts["provenance"]}
 
 
+def _with_hints(state: dict[str, torch.Tensor], unet: UNetConfig) -> dict[str, torch.Tensor]:
+    """Weights of a network without hints for one with them: its further input channels, the last, are zero."""
+    weight = state["conv_in.weight"]
+    missing = unet.input_channels - weight.shape[1]
+    return state | {"conv_in.weight": torch.nn.functional.pad(weight, (0, 0, 0, 0, 0, missing))}
+
+
 def _from_stable_diffusion(path: Path, config: ModelConfig) -> Any:
     kept = ("latent_channels", "latent_size", "view_attention", "max_3d_size", "decoder_only", "camera", "ray_octaves",
-            "relative_cameras")  # fmt: skip
+            "relative_cameras", "hints")  # fmt: skip
     changes = {name: getattr(config.unet, name) for name in kept}
     return load_stable_diffusion(path, **changes)
 

@@ -11,7 +11,9 @@ from typing import Any
 import torch
 
 from cat3d_core.diffusion import Autoencoder, LatentBank, ModelConfig, load_model
-from cat3d_core.weights import default_model_path
+from cat3d_core.diffusion.hint_bank import HintBank
+from cat3d_core.matching.checkpoint import describe_sweep, load_sweep
+from cat3d_core.weights import default_model_path, default_sweep_path
 from flows.errors import InputError
 from flows.media.images import read_image
 from flows.progress import console, meter
@@ -24,6 +26,7 @@ from flows.training.autoencoder import (
     train_autoencoder,
 )
 from flows.training.bank import encode_shards, load_bank
+from flows.training.hint_bank import load_hint_bank, predict_shards, sources
 from flows.training.ranks import Ranks
 from flows.training.worlds.package import TRAINING
 from flows.training.worlds.shards import SHARD_GROUPS, shard_numbers, world_shards
@@ -33,8 +36,11 @@ from schemas.training import TrainRunConfig
 AUTOENCODER = "autoencoder.safetensors"
 
 
-def prepare(config: TrainRunConfig, network: ModelConfig, folder: Path, own: Ranks) -> tuple[Autoencoder, LatentBank]:
-    """Render, get the autoencoder, encode; each is skipped where its result is in `folder`. The ranks share the work.
+def prepare(
+    config: TrainRunConfig, network: ModelConfig, folder: Path, own: Ranks
+) -> tuple[Autoencoder, LatentBank | HintBank]:
+    """Render, get the autoencoder, encode or, for a network that takes hints, predict groups with them; each is skipped
+    where its result is in `folder`. The ranks share the work.
 
     Raises ConfigError for a bank that is too large, or a folder that holds another one."""
     bank, size, seed = config.bank, network.image_size, bank_seed(config)
@@ -53,7 +59,8 @@ def prepare(config: TrainRunConfig, network: ModelConfig, folder: Path, own: Ran
     procedural = renders.shard_numbers(bank.scenes)
     mine = procedural[own.rank :: own.world]
     everything = range(len(procedural) + len(shard_numbers(groups)))
-    complete = len(renders.shards(folder, "latents")) == len(everything)
+    kind = "renders" if network.unet.hints else "latents"
+    complete = len(renders.shards(folder, kind)) == len(everything)
     photos = read_photos(bank.textures) if bank.textures and not complete else None
     scenes = sum(min(renders.SHARD_SCENES, bank.scenes - n * renders.SHARD_SCENES) for n in mine)
     with meter("render scenes", scenes) as bar:
@@ -66,6 +73,8 @@ def prepare(config: TrainRunConfig, network: ModelConfig, folder: Path, own: Ran
             world_shards(folder, bank.worlds, TRAINING, turns, bank.views, size, seed, bar.advance, len(procedural))
     own.barrier()
     autoencoder = get_autoencoder(config, network, folder, photos, own)
+    if network.unet.hints:
+        return autoencoder.cpu(), hinted(config, network, folder, autoencoder, own)
     mine = everything[own.rank :: own.world]
     with meter("encode shards", len(mine)) as bar:
         encode_shards(folder, autoencoder, bank.variants, own.device, mine, bar.advance)
@@ -73,6 +82,24 @@ def prepare(config: TrainRunConfig, network: ModelConfig, folder: Path, own: Ran
     latents = load_bank(folder, size)
     console.print(f"  bank: {len(latents)} scenes of {bank.views} views, {needed / 2**20:.0f} MiB in {folder}")
     return autoencoder.cpu(), latents
+
+
+def hinted(
+    config: TrainRunConfig, network: ModelConfig, folder: Path, autoencoder: Autoencoder, own: Ranks
+) -> HintBank:
+    """The groups with hints, predicted where they are not there yet."""
+    tasks = sources(folder, config.bank.others)
+    mine = tasks[own.rank :: own.world]
+    sweep = load_sweep(config.bank.sweep or default_sweep_path(), own.device)
+    with meter("predict hints of shards", len(mine)) as bar:
+        predict_shards(
+            folder, mine, sweep, autoencoder.to(own.device).eval(), config.conditions, config.model.views,
+            network.image_size, bank_seed(config), bar.advance,
+        )  # fmt: skip
+    own.barrier()
+    bank = load_hint_bank(folder, network.image_size)
+    console.print(f"  bank: {len(bank)} groups of {config.model.views} views with hints, in {folder}")
+    return bank
 
 
 def bank_seed(config: TrainRunConfig) -> int:
@@ -83,7 +110,10 @@ def bank_seed(config: TrainRunConfig) -> int:
 def _identity(config: TrainRunConfig, network: ModelConfig) -> dict[str, Any]:
     """What the contents of a bank depend on."""
     without = set() if config.bank.worlds else {"world_groups"}
-    bank = config.bank.model_dump(mode="json", exclude={"folder", "seed", "max_gib", "worlds"} | without)
+    without |= {"folder", "seed", "max_gib", "worlds", "others", "sweep"}
+    bank = config.bank.model_dump(mode="json", exclude=without)
+    if network.unet.hints:
+        bank |= {"hints": describe_sweep(config.bank.sweep or default_sweep_path())["sha256"]}
     network_document = json.loads(network.to_json())["autoencoder"]
     wanted = config.autoencoder.model_dump(mode="json")
     return {"bank": bank, "image_size": network.image_size, "seed": bank_seed(config), "network": network_document,

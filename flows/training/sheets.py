@@ -19,6 +19,7 @@ from cat3d_core.random import normal
 from cat3d_core.synthetic.held_out import held_out_group
 from cat3d_core.view_selection import camera_distance
 from flows.media.images import write_png
+from flows.training.hint_bank import told
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,8 @@ def sampled(generator: Generator, scenes: HeldOut, given: int, steps: int) -> Te
     sampler = SamplerConfig(steps=steps, guidance=GuidanceConfig(scale=1.0), micro_batch=min(len(scenes.images), 8))
     shape = generator.spec.latent_shape
     groups = [(images[:given], cameras) for images, cameras in zip(scenes.images, scenes.cameras, strict=True)]
-    made = generate(generator, groups, sampler, lambda group, view: normal(shape, 0, "sheet", group, view))
+    hints = [told(generator, *group) for group in groups]
+    made = generate(generator, groups, sampler, lambda group, view: normal(shape, 0, "sheet", group, view), hints)
     return torch.stack(made)
 
 

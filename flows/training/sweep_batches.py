@@ -98,6 +98,12 @@ def prepared(raw: dict[str, Tensor], size: int, random: torch.Generator) -> Scen
     return Scene(image, depth, views(cameras))
 
 
+def cameras_of(cameras: Views, side: int) -> Cameras:
+    """Views as the cameras of square images of `side` pixels."""
+    pixels = torch.tensor([[side / 2, 0, side / 2], [0, side / 2, side / 2], [0, 0, 1]], dtype=torch.float64)
+    return Cameras(pixels @ cameras.k, cameras.pose, torch.full((len(cameras.k), 2), side, dtype=torch.int64))
+
+
 def augmented(scene: Scene, random: torch.Generator) -> Scene:
     """Another scene of the same shape: mirrored, recoloured, with other contrast and scale."""
     image, depth, k, pose = scene.image, scene.inverse_depth, scene.views.k.clone(), scene.views.pose.clone()

@@ -17,11 +17,14 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
+from cat3d_core.generation import Cat3dGenerator
 from cat3d_core.matching.checkpoint import load_sweep
 from cat3d_core.matching.composite import Composite
 from cat3d_core.matching.network import SweepNetwork
+from cat3d_core.weights import default_model_path
+from flows.generation.formats import cat3d
 from flows.training.renders import save, shards
-from flows.training.sweep_evaluation import VIEWS, Case, case, sampled, swept
+from flows.training.sweep_evaluation import VIEWS, Case, case, hinted_sample, sampled, swept
 
 MIDDLES = torch.linspace(0.05, 0.75, 15).tolist()
 SOFTNESSES = (0.05, 0.1, 0.15, 0.2, 0.3)
@@ -50,13 +53,17 @@ def _group(shard: dict[str, Tensor], number: int, given: int) -> dict[str, Tenso
     return sampled(image, cameras, given, ("composite", number)) | {"inverse_depth": depth}
 
 
-def fitted(network: SweepNetwork, found: Iterator[Case]) -> tuple[Composite, dict[str, float]]:
-    """The best composite, and mean PSNR (over folders and numbers of given views) of sweep, sample and composite."""
+def fitted(
+    network: SweepNetwork, found: Iterator[Case], generator: Cat3dGenerator | None = None
+) -> tuple[Composite, dict[str, float]]:
+    """The best composite, and mean PSNR (over folders and numbers of given views) of sweep, sample and composite.
+
+    generator: makes the samples, if it takes hints."""
     grid = [Composite(middle, softness) for middle in MIDDLES for softness in SOFTNESSES]
     errors: dict[tuple[str, int], list[Tensor]] = {}
     for one in found:
         h, truth = swept(network, one), one.image[one.given :]
-        sample = one.pictures["sample"]
+        sample = one.pictures["sample"] if generator is None else hinted_sample(generator, one, h)
         pictures = [h.colour, sample, *(c(h.colour, h.confidence, sample) for c in grid)]
         decibels = [-10 * (p - truth).square().mean((1, 2, 3)).log10().mean() for p in pictures]
         errors.setdefault((one.labels[0], one.given), []).append(torch.stack(decibels))
@@ -69,6 +76,7 @@ def fitted(network: SweepNetwork, found: Iterator[Case]) -> tuple[Composite, dic
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("network", type=Path)
+    parser.add_argument("--model", type=Path, help="the diffusion model; none: the one shipped")
     parser.add_argument("folders", type=Path, nargs="+", help="folders of a sweep's bank")
     parser.add_argument("--scenes", type=int, default=12, help="of each folder")
     parser.add_argument("--given", type=int, nargs="+", default=[3, 1])
@@ -77,7 +85,8 @@ def main() -> None:
     torch.set_num_threads(1)
     options.cache.mkdir(parents=True, exist_ok=True)
     found = validation_cases(options.folders, options.cache, options.scenes, options.given)
-    best, psnr = fitted(load_sweep(options.network), found)
+    generator = cat3d.load(options.model or default_model_path(), "cpu", "bfloat16")
+    best, psnr = fitted(load_sweep(options.network), found, generator)
     print(json.dumps({"composite": json.loads(best.to_json()), "psnr_db": psnr}))
 
 

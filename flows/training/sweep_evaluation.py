@@ -11,6 +11,8 @@ For each target view of a group of 8 (M given, 8 - M targets), against its exact
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import functools
 import json
 import time
 from collections import defaultdict
@@ -25,6 +27,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
+from cat3d_core.diffusion import SamplerConfig
+from cat3d_core.generation import Cat3dGenerator, generate
 from cat3d_core.generation.advice import FEW_STEPS
 from cat3d_core.matching.checkpoint import load_sweep
 from cat3d_core.matching.composite import Composite
@@ -33,8 +37,11 @@ from cat3d_core.matching.network import SweepNetwork
 from cat3d_core.metrics.perceptual import PerceptualDistance, find_perceptual
 from cat3d_core.metrics.psnr import psnr
 from cat3d_core.metrics.ssim import ssim
+from cat3d_core.random import normal
 from cat3d_core.synthetic import FAMILIES
 from cat3d_core.synthetic.held_out import held_out_group
+from cat3d_core.view_selection import camera_distance
+from cat3d_core.warp import warp
 from cat3d_core.weights import default_model_path
 from flows.generation.formats import cat3d
 from flows.training.evaluation import (
@@ -98,17 +105,30 @@ def case(name: str, labels: tuple[str, ...], given: int, stored: dict[str, Tenso
     return Case(name, labels, given, image, cameras, {k: t.float() for k, t in stored.items()}, depth)
 
 
-_MODEL: list[Any] = []
+@functools.lru_cache(maxsize=1)
+def model() -> Cat3dGenerator:
+    """The shipped diffusion model, loaded when it is first needed."""
+    return cat3d.load(default_model_path(), "cpu", "bfloat16")
 
 
 def sampled(image: Tensor, cameras: Cameras, given: int, key: tuple) -> dict[str, Tensor]:
-    """`sample` and `nearest`, with the shipped model, which is loaded when it is first needed."""
-    if not _MODEL:
-        _MODEL.append(cat3d.load(default_model_path(), "cpu", "bfloat16"))
-    images = evaluate_group(_MODEL[0], image, cameras, given, FEW_STEPS, key)
+    """`sample`, with the shipped model and without hints, and `nearest`."""
+    images = evaluate_group(model(), image, cameras, given, FEW_STEPS, key)
     return {name: images[name].half() for name in ("sample", "nearest")} | {
         "image": image, "intrinsics": cameras.intrinsics, "world_from_camera": cameras.world_from_camera,
     }  # fmt: skip
+
+
+def hinted_sample(generator: Cat3dGenerator, case: Case, found: Hint, sampler: SamplerConfig = FEW_STEPS) -> Tensor:
+    """A sample of the targets (N, 3, H, W) by a model that takes hints; `case`'s own for one that doesn't."""
+    if "hints" not in generator.spec.wants:
+        return case.pictures["sample"]
+    shape = generator.spec.latent_shape
+    (made,) = generate(
+        generator, [(case.image[: case.given], case.cameras)], sampler,
+        lambda _, view: normal(shape, 0, case.name, view, "noise"), [vars(found)],
+    )  # fmt: skip
+    return made
 
 
 def _procedural(path: Path, family: str, number: int, given: int) -> dict[str, Tensor]:
@@ -143,20 +163,21 @@ def swept(network: SweepNetwork, case: Case) -> Hint:
 
 def scores(
     network: SweepNetwork, found: Iterator[Case], composite: Composite, perceptual: PerceptualDistance | None,
-    pictures: Path | None = None,
+    pictures: Path | None = None, generator: Cat3dGenerator | None = None, sampler: SamplerConfig = FEW_STEPS,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """One row per label, number of given views and method: means over groups of PSNR, SSIM and perceptual distance;
-    with the method `sweep`, also over its confident pixels (> 0.5), the error of inverse depth and seconds of the
-    processor a view.
+    over the pixels that the sweep is confident of (> 0.5) and over the others; how well targets agree (`disagreement`);
+    with the method `sweep`, also the error of inverse depth and seconds of the processor a view.
 
-    pictures: a folder for a contact sheet of each group."""
+    generator: makes the samples, if it takes hints. pictures: a folder for a contact sheet of each group."""
     rows: dict[tuple[str, int, str], list[dict[str, float]]] = defaultdict(list)
     for case in found:
         started = time.process_time()
         h, truth = swept(network, case), case.image[case.given :]
         seconds = (time.process_time() - started) / len(truth)
+        sample = case.pictures["sample"] if generator is None else hinted_sample(generator, case, h, sampler)
         images = case.pictures | {
-            "sweep": h.colour, "composite": composite(h.colour, h.confidence, case.pictures["sample"]),
+            "sample": sample, "sweep": h.colour, "composite": composite(h.colour, h.confidence, sample),
         }  # fmt: skip
         if pictures is not None:
             shown = images | {"truth": truth, "confidence": h.confidence[:, None].expand(-1, 3, -1, -1)}
@@ -166,6 +187,8 @@ def scores(
             if perceptual is not None:
                 score[perceptual.name] = float(perceptual(picture, truth).mean())
             score |= _confident(picture, truth, h.confidence)
+            if case.inverse_depth is not None and len(truth) > 1:
+                score["disagreement"] = disagreement(picture, case.inverse_depth, case.cameras[slice(case.given, None)])
             if method == "sweep":
                 score |= {"confidence": float(h.confidence.mean()), "cpu_s": seconds}
                 score |= _calibration(picture, truth, h.confidence)
@@ -183,6 +206,18 @@ def scores(
 
 def _mean(values: Sequence[float]) -> float:
     return sum(values) / max(len(values), 1)
+
+
+def disagreement(picture: Tensor, inverse_depth: Tensor, cameras: Cameras) -> float:
+    """Mean absolute difference between N pictures (N, 3, H, W) of one scene and what the nearest other one shows of the
+    same places, carried over by the true inverse depths (N, H, W)."""
+    apart = camera_distance(cameras).fill_diagonal_(torch.inf)
+    depth, found = 1 / inverse_depth.clamp_min(1e-6), []
+    for i, j in enumerate(apart.argmin(1).tolist()):
+        image, seen = warp([picture[j]], [depth[j]], cameras[[j]], cameras[i], depth[i])
+        if seen.any():
+            found.append(float((image - picture[i]).abs().mean(0)[seen.reshape(depth[i].shape)].mean()))
+    return _mean(found)
 
 
 def _confident(picture: Tensor, truth: Tensor, confidence: Tensor) -> dict[str, float]:
@@ -227,6 +262,9 @@ def table(rows: list[dict[str, Any]], perceptual: str | None) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("network", type=Path, nargs="?", help="the sweep's weights; none: only fill the cache")
+    parser.add_argument("--model", type=Path, help="the diffusion model; none: the one shipped")
+    parser.add_argument("--steps", type=int, default=FEW_STEPS.steps, help="of the sampler, for a model with hints")
+    parser.add_argument("--start", choices=("noise", "hint"), default="noise", help="where such a model starts")
     parser.add_argument("--scenes", type=int, default=20, help="held-out scenes per family")
     parser.add_argument("--given", type=int, nargs="+", default=[3, 1])
     parser.add_argument("--data", type=Path, help="folder with captured scenes")
@@ -246,7 +284,9 @@ def main() -> None:
             pass
         return
     network, perceptual = load_sweep(options.network), find_perceptual()
-    rows = scores(network, found, network.composite, perceptual, options.pictures)
+    generator = cat3d.load(options.model or default_model_path(), "cpu", "bfloat16")
+    sampler = dataclasses.replace(FEW_STEPS, steps=options.steps, start=options.start)
+    rows = scores(network, found, network.composite, perceptual, options.pictures, generator, sampler)
     if options.json:
         options.json.write_text(json.dumps(rows))
     print(table(rows, perceptual.name if perceptual else None))

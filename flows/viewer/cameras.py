@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.splats.gaussians import quaternions_from_rotations, rotation_matrices
+from cat3d_core.quaternions import quaternions_from_rotations, rotation_matrices
 
 LARGEST = 1280
 """Longer side in pixels of what is rendered for a browser, whatever the size of its window."""

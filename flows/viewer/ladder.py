@@ -25,6 +25,10 @@ TILE = 96
 CHANNELS = ("colour", "depth", "normals", "opacity", "uncertainty")
 
 
+class StoppedError(Exception):
+    """The viewer ends: leave whatever you do."""
+
+
 @dataclass(frozen=True)
 class Wish:
     """What a browser rests on: one camera (scene frame) of its window's size, what of it to show, and the scene; with a
@@ -71,13 +75,22 @@ class Ladder:
             self._work.pop(who, None)
             if wish is not None:
                 self._work[who] = _Work(wish)
-            self._changed.notify()
+            self._changed.notify_all()
+
+    def wait(self) -> None:
+        """Return once everybody has a picture of half size or nothing to wait for: what else works on the same cores
+        asks here. Raises StoppedError after `stop`."""
+        last = len(self._scales) - 1
+        with self._changed:
+            self._changed.wait_for(lambda: self._stopped or all(w.rung >= last for w in self._work.values()))
+            if self._stopped:
+                raise StoppedError
 
     def stop(self) -> None:
         """End the thread, after the tile that it is at."""
         with self._changed:
             self._stopped = True
-            self._changed.notify()
+            self._changed.notify_all()
         self._thread.join()
 
     def _run(self) -> None:
@@ -118,7 +131,9 @@ class Ladder:
         if area is not None:
             _render(work, camera, area)
             return None
-        work.rung, work.tiles = work.rung + 1, None
+        with self._changed:
+            work.rung, work.tiles = work.rung + 1, None
+            self._changed.notify_all()
         return Picture(_coloured(work.parts, work.wish.channel), work.parts["depth"], scale)
 
 

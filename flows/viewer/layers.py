@@ -39,7 +39,7 @@ def add_view(scene: viser.SceneApi, view: ShownView, size: float, on_click: Call
     handle = scene.add_camera_frustum(
         f"/{GROUPS[view.kind]}/{view.index}", vertical_fov(view.camera), aspect(view.camera), scale=size, color=colour,
         image=None if view.image is None else thumbnail(view.image), wxyz=wxyz, position=position,
-        cast_shadow=False, receive_shadow=False,
+        thickness=size / 60, cast_shadow=False, receive_shadow=False,
     )  # fmt: skip
     handle.on_click(lambda _: on_click(view))
     return handle
@@ -79,14 +79,3 @@ def add_splats(scene: viser.SceneApi, splats: Gaussians, visible: bool) -> Any:
         "/splats", splats.means.double().numpy() * ENLARGED, covariances.numpy(), colours.numpy(),
         splats.opacities[:, None].numpy(), scale=1 / ENLARGED, visible=visible,
     )  # fmt: skip
-
-
-def side_by_side(pictures: list[np.ndarray]) -> np.ndarray:
-    """Pictures of one height beside each other, with a white line between."""
-    height = max(picture.shape[0] for picture in pictures)
-    parts: list[np.ndarray] = []
-    for picture in pictures:
-        scale = height / picture.shape[0]
-        parts.append(resize(picture, max(1, round(picture.shape[1] * scale)), height))
-        parts.append(np.full((height, 2, 3), 255, np.uint8))
-    return np.concatenate(parts[:-1], 1)

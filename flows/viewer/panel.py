@@ -13,9 +13,10 @@ from cat3d_core.cameras import Cameras
 from flows.errors import InputError, describe
 from flows.exports.path import parse_path
 from flows.reporting.content import ShownView
+from flows.viewer.beside import companions, side_by_side
 from flows.viewer.keyframes import FPS, as_bytes, nerfstudio_document, path_document, smooth_path
 from flows.viewer.ladder import CHANNELS
-from flows.viewer.layers import side_by_side
+from flows.viewer.results import Results
 from flows.viewer.run import OpenRun, Runs
 
 LAYERS = ("reconstruction", "splats", "points", "captured", "held out", "generated", "planned", "path")
@@ -45,22 +46,14 @@ class Panel:
         self.session = session
         self.keyframes: list[Cameras] = []
         gui = session.client.gui
-        self._table, self._names = None, list(session.runs.names)
-        if session.runs.table is not None:
-            with gui.add_folder("Results"):
-                table = session.runs.table
-                sort = gui.add_dropdown("Sort by", table.columns)
-                rising = gui.add_checkbox("Rising", True)
-                self._table = gui.add_html(table.html(table.columns[0], True))
-                sorting: list[Any] = [sort, rising]
-                for control in sorting:
-                    control.on_update(lambda _: self._sort(sort.value, rising.value))
-        self._run: Any = gui.add_dropdown("Run", self._names)
+        self._results: Results | None = None
+        names = session.runs.names
+        self._run: Any = gui.add_dropdown("Run", names)
         self._run.on_update(lambda _: self._open(self._run.value))
         self._state = gui.add_markdown("")
         with gui.add_folder("Show"):
             self._channel = gui.add_dropdown("Picture", CHANNELS)
-            self._other = gui.add_dropdown("Compare with", (NOTHING, *self._names))
+            self._other = gui.add_dropdown("Compare with", (NOTHING, *names))
             self._split = gui.add_slider("Split", 0.0, 1.0, 0.01, 0.5)
             self._on: dict[str, Any] = {
                 name: gui.add_checkbox(name.capitalize(), name not in ("planned",)) for name in LAYERS
@@ -70,8 +63,8 @@ class Panel:
             control.on_update(lambda _: session.moved())
         for name in LAYERS[1:]:
             self._on[name].on_update(lambda _: session.shown())
-        with gui.add_folder("View", expand_by_default=False) as self._beside:
-            gui.add_markdown("Click a camera to see its picture beside the reconstruction's.")
+        with gui.add_folder("View") as self._beside:
+            self._beside_text = gui.add_markdown("Click a camera: its photo, generated view and render, side by side.")
         self._beside_image: Any = None
         with gui.add_folder("Camera path", expand_by_default=False):
             self._count = gui.add_markdown("No keyframes yet.")
@@ -82,6 +75,7 @@ class Panel:
             self._button("Save for nerfstudio", lambda: self._save("camera_path.json", nerfstudio_document))
             upload = gui.add_upload_button("Load path")
             upload.on_upload(lambda _: self._guarded(lambda: self._load(upload.value.content)))
+        self.listed()
 
     def _button(self, label: str, act: Callable[[], Any]) -> None:
         self.session.client.gui.add_button(label).on_click(lambda _: self._guarded(act))
@@ -136,26 +130,30 @@ class Panel:
             self._run.value = run.name
         self._state.content = run.state()
 
-    def _sort(self, column: str, rising: bool) -> None:
-        table = self.session.runs.table
-        if table is not None and self._table is not None:
-            self._table.content = table.html(column, rising)
+    def listed(self) -> None:
+        """Offer the runs that there are now, and their results."""
+        runs = self.session.runs
+        if tuple(self._run.options) != tuple(runs.names):
+            self._run.options, self._other.options = tuple(runs.names), (NOTHING, *runs.names)
+        if runs.table is not None:
+            if self._results is None:
+                self._results = Results(self.session.client.gui, runs.table, self._open)
+            elif self._results.table != runs.table:
+                self._results.show(runs.table)
 
     def beside(self, view: ShownView, rendered: np.ndarray | None) -> None:
-        """Show a view's picture and the reconstruction's from there, side by side."""
-        pictures = [picture for picture in (view.image, rendered) if picture is not None]
+        """Show the photo, the generated view and the reconstruction's render of a camera side by side."""
+        shown = companions(view, self.session.run.views if self.session.run else [])
+        if rendered is not None:
+            shown.append(("rendered", rendered))
         if self._beside_image is not None:
             self._beside_image.remove()
             self._beside_image = None
-        if pictures:
-            shown = " | ".join(
-                name for name, picture in ((view.kind, view.image), ("rendered", rendered)) if picture is not None
-            )
+        self._beside_text.content = f"**{view.name}**: {' | '.join(caption for caption, _ in shown)}"
+        if shown:
             with self._beside:
-                label = f"{view.name}: {shown}"
-                self._beside_image = self.session.client.gui.add_image(
-                    side_by_side(pictures), label=label, format="png"
-                )
+                picture = side_by_side([picture for _, picture in shown])
+                self._beside_image = self.session.client.gui.add_image(picture, format="png")
 
     # Keyframes
 

@@ -12,9 +12,11 @@ import viser
 
 from cat3d_core.cameras import Cameras
 from flows.errors import describe
+from flows.exports.preview import within
 from flows.media.images import to_uint8
 from flows.reporting.content import ShownView
 from flows.viewer import layers
+from flows.viewer.beside import SIDE
 from flows.viewer.cameras import camera_of, place, vertical_fov
 from flows.viewer.ladder import Ladder, Picture, Wish
 from flows.viewer.panel import Panel
@@ -22,8 +24,10 @@ from flows.viewer.run import OpenRun, Runs
 
 REST = 0.25
 """Seconds without a move after which a camera rests."""
-FRUSTUM = 0.12
+FRUSTUM = 0.08
 """Size of a frustum in scene units: the cameras look at the origin from about 1."""
+HIDDEN = 2.5 * FRUSTUM
+"""Cameras that are nearer than this to the one that looks are left out: their pictures would be all that it sees."""
 
 
 class Session:
@@ -35,6 +39,7 @@ class Session:
         self._lock = threading.RLock()
         self._views: dict[str, list[Any]] = {}
         self._layers: dict[str, Any] = {}
+        self._placed = False
         self._timer: threading.Timer | None = None
         self._resting = False
         self.shown_picture: tuple[Wish, Picture] | None = None
@@ -50,16 +55,13 @@ class Session:
     # What there is to see
 
     def open(self, run: OpenRun) -> None:
-        """Show another run, from its first captured view."""
+        """Show another run, from its first captured view as soon as there is one."""
         with self._lock:
             self.run = run
             self.client.scene.reset()
-            self._views, self._layers = {}, {}
+            self._views, self._layers, self._placed = {}, {}, False
             self.draw()
             self.panel.opened()
-            first = next(iter(run.views), None)
-            if first is not None:
-                self.fly(first.camera)
         self.moved()
 
     def draw(self) -> None:
@@ -78,10 +80,13 @@ class Session:
                     self._views["planned"].remove(handle)
             planned = [view for view in run.views if view.kind in ("planned", "generated")]
             self._layers["path"] = layers.add_path(self.client.scene, planned)
-            if "points" not in self._layers:
+            if self._layers.get("points") is None:
                 self._layers["points"] = layers.add_points(self.client.scene, run.points)
             if run.splats is not None:
                 self._layers["splats"] = layers.add_splats(self.client.scene, run.splats, not self._resting)
+            if run.views and not self._placed:  # a run that has just begun has no cameras yet
+                self._placed = True
+                self.fly(run.views[0].camera)
         self.shown()
 
     def shown(self) -> None:
@@ -91,9 +96,8 @@ class Session:
         with self._lock:
             for group, handles in self._views.items():
                 for handle in handles:
-                    # One that stands in a frustum would see its picture, not the scene.
-                    inside = here is not None and float(np.linalg.norm(handle.position - here)) < FRUSTUM
-                    if handle.visible != (on(group) and not inside):
+                    close = here is not None and float(np.linalg.norm(handle.position - here)) < HIDDEN
+                    if handle.visible != (on(group) and not close):
                         handle.visible = not handle.visible
             for name, handle in self._layers.items():
                 if handle is not None:
@@ -151,14 +155,15 @@ class Session:
             self.client.camera.fov = vertical_fov(camera)
 
     def clicked(self, view: ShownView) -> None:
-        """Fly to a view, and show its picture beside what the reconstruction shows there."""
+        """Fly to a view, and show its photo and generated view beside what the reconstruction shows there."""
         self.fly(view.camera)
         run = self.run
         rendered = None
         if run is not None and run.scene is not None:
             try:
+                camera = within(view.camera, SIDE).to(dtype=torch.float32)
                 with torch.no_grad():
-                    rendered = to_uint8(run.scene.render(view.camera.to(dtype=torch.float32), 0).image.cpu())
+                    rendered = to_uint8(run.scene.render(camera, 0).image.cpu())
             except Exception as error:
                 self.say(describe(error) or str(error))
         self.panel.beside(view, rendered)

@@ -12,7 +12,7 @@ from collections import Counter
 from pathlib import Path
 from typing import BinaryIO, cast
 
-from flows.jobs.device import total_memory, visible_gpus, worker_count
+from flows.jobs.device import main_memory, visible_gpus, worker_count
 from flows.jobs.needs import Needs
 from flows.workers.work import Answer, Batch
 from schemas.execution import ExecutionConfig
@@ -29,7 +29,7 @@ class LocalExecutor:
         self.threads = settings.threads
         self.log_folder = log_folder
         self.running: dict[int, _Worker] = {}  # by place, 0 to count - 1
-        memory = total_memory()
+        memory = main_memory()
         self.memory_gb = None if memory is None else memory / 1e9
         self.selector = selectors.DefaultSelector()
         self.rung, self.bell = os.pipe()  # what `wake` writes to ends the selector's wait

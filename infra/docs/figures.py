@@ -60,9 +60,12 @@ def report(showcase: Path) -> None:
         size = f"--window-size={REPORT_WIDTH},{REPORT_HEIGHT}"
         subprocess.run([browser, *flags, size, f"--screenshot={out}", page.resolve().as_uri()], check=True,
                        capture_output=True, timeout=300)  # fmt: skip
+    import numpy as np
     from PIL import Image
 
-    Image.open(out).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(out, optimize=True)
+    from infra.docs.strip import save
+
+    save(np.asarray(Image.open(out).convert("RGB")), out)
     print(out.relative_to(ROOT))
 
 

@@ -16,6 +16,7 @@ from flows.media.images import to_uint8
 from flows.media.pictures import depth_picture
 
 SIDE, GAP = 192, 6
+MOST_BYTES = 300_000
 #: Cube around what the cameras look at that the mesh covers (units of the mean distance), and voxels along it.
 RADIUS, VOXELS = 1.0, 160
 
@@ -36,8 +37,16 @@ def write_strip(store: Path, run: str, folder: Path) -> list[Path]:
     out = []
     for name, picture in pictures.items():
         out.append(folder / f"strip_{name}.png")
-        Image.fromarray(picture).quantize(256, dither=Image.Dither.NONE).save(out[-1], optimize=True)
+        save(picture, out[-1])
     return out
+
+
+def save(picture: np.ndarray, path: Path) -> None:
+    """Write a PNG (uint8 RGB), with 256 colours where it would be larger than a page should load."""
+    image = Image.fromarray(picture)
+    image.save(path, optimize=True)
+    if path.stat().st_size > MOST_BYTES:
+        image.quantize(256, dither=Image.Dither.NONE, kmeans=3).save(path, optimize=True)
 
 
 def tile(images: list[np.ndarray], columns: int, side: int = SIDE) -> np.ndarray:

@@ -10,7 +10,7 @@
 # left in OUT is made to travel: few files of at most 15 MiB. Another `train` on the same machine is another leg, from the
 # weights of the last one and on its bank; elsewhere a leg starts from the shipped weights.
 #
-# PRESET=default_gpu, or sweep_gpu for the plane sweep  SETTINGS="optimizer.groups=128 ..."  TEXTURES=FOLDER  SCENES=4 (held out, a family)  RESERVE=100
+# PRESET=default_gpu, sweep_gpu for the plane sweep, or hints_gpu for the model with the sweep's hints  SETTINGS="optimizer.groups=128 ..."  TEXTURES=FOLDER  SCENES=4 (held out, a family)  RESERVE=100
 # (seconds kept for evaluating and packing)  RANKS (processes that render the bank; all cores)  WORK=outputs/lease  WHEELS=.whl
 set -euo pipefail
 cd "$(dirname "$0")/../.."
@@ -32,8 +32,10 @@ wheels() {
 }
 
 train() {
-  local out=$1 seconds=${2:-560} preset=${PRESET:-default_gpu} name=default file=model prefix="" start leg settings=()
+  local out=$1 seconds=${2:-560} preset=${PRESET:-default_gpu} name=default file=model prefix="" start leg settings=() bank_device=cpu
   if grep -q '^kind: sweep' "flows/training/presets/$preset.yaml"; then name=sweep file=sweep prefix=sweep_; fi
+  # Hints are predicted by a network: by one process, on the GPU. They and the networks that take them are legs of their own.
+  if grep -q 'hints: true' "flows/training/presets/$preset.yaml"; then prefix=hints_ bank_device=auto RANKS=1; fi
   start=cat3d_core/weights/$name.safetensors
   mkdir -p "$out" "$WORK"
   site
@@ -46,7 +48,7 @@ train() {
   done
   # Rendering is many small steps: all cores do it sooner than the GPU would.
   OMP_NUM_THREADS=1 "$PYTHON" -m torch.distributed.run --standalone --nproc-per-node "${RANKS:-$(nproc)}" -m flows.cli \
-    train "$preset" --out "$WORK/${prefix}bank" --bank-only --device cpu "${settings[@]}"
+    train "$preset" --out "$WORK/${prefix}bank" --bank-only --device "$bank_device" "${settings[@]}"
   local left=$((seconds - SECONDS - ${RESERVE:-100}))
   if [ "$left" -lt 5 ]; then echo "The bank took $SECONDS s: no time is left to train in; ask for fewer bank.scenes." >&2; exit 1; fi
   "$PYTHON" -m flows.cli train "$preset" --out "$WORK/${prefix}leg_$leg" --start "$start" "${settings[@]}" \
@@ -58,8 +60,8 @@ train() {
     fi
     tar czf "$out/training.tar.gz" -C "$WORK/sweep_leg_$leg" training validation training.json
   else
-    "$PYTHON" infra/export_default.py "$WORK/leg_$leg" --scenes "${SCENES:-4}" --to "$out" --threads "$(nproc)"
-    tar czf "$out/training.tar.gz" -C "$WORK/leg_$leg" training samples training.json
+    "$PYTHON" infra/export_default.py "$WORK/${prefix}leg_$leg" --scenes "${SCENES:-4}" --to "$out" --threads "$(nproc)"
+    tar czf "$out/training.tar.gz" -C "$WORK/${prefix}leg_$leg" training samples training.json
   fi
   (cd "$out" && sha256sum $name.safetensors >$name.sha256 && split -b 15M -d $name.safetensors $name.part. && rm $name.safetensors)
   echo "Leg $leg: $SECONDS s in all, $left of them training, from $start. Left in $out:"

@@ -75,16 +75,26 @@ class Tab:
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
         return read_image(path)[0][..., :3]
 
-    def drag(self, start: tuple[int, int], by: tuple[int, int], steps: int = 6) -> None:
+    def drag(self, start: tuple[float, float], by: tuple[float, float], steps: int = 6) -> None:
         """Press the left button at a point of the window, move and let go."""
-
-        def mouse(kind: str, x: float, y: float) -> None:
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
-
-        mouse("mousePressed", *start)
+        self._mouse("mousePressed", *start)
         for i in range(1, steps + 1):
-            mouse("mouseMoved", start[0] + by[0] * i / steps, start[1] + by[1] * i / steps)
-        mouse("mouseReleased", start[0] + by[0], start[1] + by[1])
+            self._mouse("mouseMoved", start[0] + by[0] * i / steps, start[1] + by[1] * i / steps)
+        self._mouse("mouseReleased", start[0] + by[0], start[1] + by[1])
+
+    def click(self, x: float, y: float) -> None:
+        """Go to a point of the window and click it."""
+        self._mouse("mouseMoved", x, y, buttons=0)
+        self._mouse("mousePressed", x, y)
+        self._mouse("mouseReleased", x, y)
+
+    def _mouse(self, kind: str, x: float, y: float, buttons: int = 1) -> None:
+        button = "left" if buttons else "none"
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, buttons=buttons, clickCount=buttons)
+
+    def resize(self, width: int, height: int) -> None:
+        """Give the page this many pixels."""
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
 
 
 class Browser:

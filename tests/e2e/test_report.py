@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from cat3d_core.metrics.seeds import Mean
 from flows.jobs.metric_table import metric_table
 from flows.reporting.answer import answers
 from flows.reporting.charts import Point, Series, chart, log_ticks, ticks
@@ -113,8 +114,8 @@ def test_papers_layout_has_its_rows_apart_from_ours(tmp_path: Path) -> None:
     assert table["splits"] == ["3", "all"]
     *published, ours = table["datasets"][0]["rows"]
     assert [p["method"] for p in published] == ["Zip-NeRF*", "ZeroNVS*", "ReconFusion", "CAT3D"]
-    assert published[3]["cells"] == [{"psnr_db": 21.58, "ssim": 0.731, "lpips": 0.181}, None]
-    assert ours["cells"][0] == {"psnr_db": 21.0, "ssim": 0.525, "lpips": 0.5}
+    assert published[3]["cells"] == [{"psnr_db": Mean(21.58), "ssim": Mean(0.731), "lpips": Mean(0.181)}, None]
+    assert ours["cells"][0] == {"psnr_db": Mean(21.0), "ssim": Mean(0.525), "lpips": Mean(0.5)}
     assert ours["what"] == "mean of 2 scenes · 64x48 · st-lpips-alex"
     lines = (write_report(tmp_path).parent / "report.md").read_text().splitlines()
     assert "| llff | *CAT3D* | *the paper's scenes* | *21.58 / 0.731 / 0.181* | *-* |" in lines
@@ -122,6 +123,22 @@ def test_papers_layout_has_its_rows_apart_from_ours(tmp_path: Path) -> None:
         "| llff | zipnerf | mean of 2 scenes · 64x48 · st-lpips-alex | 21.00 / 0.525 / 0.500 | 30.00 / 0.750 / 0.500 |"
         in lines
     )
+
+
+def test_a_table_says_how_sure_its_means_are_and_what_is_noise(tmp_path: Path) -> None:
+    base = {"scene_id": "a", "key": "k", "protocol": "google", "view": 0, "width": 64, "height": 48, "dataset": "x",
+            "split": "3"}  # fmt: skip
+    psnr = {"best": [25.0, 25.2, 25.4], "close": [24.9, 25.1, 25.3], "far": [20.0, 20.2, 20.4]}
+    for method, values in psnr.items():
+        rows = [base | {"run": f"v3-{method}-s{s}", "method": method, "seed": s, "psnr_db": value, "ssim": 0.5}
+                for s, value in enumerate(values)]  # fmt: skip
+        append_rows(tmp_path / "metrics", metric_table(), rows, method)
+    page = write_report(tmp_path).read_text()
+    cells = {method: f"{sum(values) / 3:.2f} ± 0.12" for method, values in psnr.items()}
+    assert f">{cells['best']}<" in page
+    assert f">{cells['close']} ≈<" in page
+    assert f">{cells['far']}<" in page
+    assert f"| {cells['close']} ≈ / 0.500 ± 0.000 / - |" in (tmp_path / "report.md").read_text()
 
 
 def test_charts_have_round_ticks_and_every_finite_point() -> None:

@@ -44,7 +44,8 @@ def test_a_browser_draws_the_splats_of_a_page_like_ours(tmp_path: Path) -> None:
     file, page, c = tmp_path / "scene.splat", tmp_path / "page.html", camera()
     write_splat(file, scene())
     pose = c.world_from_camera[0].tolist()
-    rows = json.dumps([{"pose": pose, "slopes": [-0.8, 0.8, -0.5, 0.5], "colour": [1, 0, 0]}])
+    cameras = [{"pose": pose, "slopes": [-0.8, 0.8, -0.5, 0.5], "colour": [1, 0, 0]}]
+    rows = json.dumps({"cameras": cameras, "points": [[0, 0, 0], [0.2, 0, 0]]})
     script = (ROOT / "templates" / "scene.js").read_text()
     page.write_text(
         f"<canvas class=splats style='width:{SIZE[0]}px;height:{SIZE[1]}px' data-splats=s data-cameras=c></canvas>"
@@ -62,6 +63,18 @@ def test_a_browser_draws_the_splats_of_a_page_like_ours(tmp_path: Path) -> None:
         before = tab.run("document.querySelector('canvas').scene.turn")
         tab.drag((100, 100), (60, 10))
         until(lambda: tab.run("document.querySelector('canvas').scene.turn") != before)
+        # Points are grey dots of three pixels, once they are asked for.
+        grey = tab.run(
+            "(() => { const scene = document.querySelector('canvas').scene, gl = scene.gl;"
+            "scene.frusta = false; const grey = [false, true].map(shown => { scene.cloud = shown; scene.draw();"
+            "const pixels = new Uint8Array(4 * scene.canvas.width * scene.canvas.height);"
+            "gl.readPixels(0, 0, scene.canvas.width, scene.canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);"
+            "let found = 0; for (let i = 0; i < pixels.length; i += 4)"
+            "found += pixels[i] === 230 && pixels[i + 1] === 230 && pixels[i + 2] === 230;"
+            "return found; }); return grey; })()"
+        )
+        assert grey[0] < 3
+        assert 12 <= grey[1] - grey[0] <= 18
     (tmp_path / "drawn.png").write_bytes(base64.b64decode(url.partition(",")[2]))
     drawn = read_image(tmp_path / "drawn.png")[0][..., :3] / 255
     ours = render(read_splat(file), c, 0).image.numpy()

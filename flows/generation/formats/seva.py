@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import torch
@@ -10,8 +11,7 @@ from cat3d_core.generation import Generator, GeneratorSpec
 from cat3d_core.seva.checkpoint import FILE_NAMES, find_seva, read_config
 from cat3d_core.seva.generator import SevaGenerator, seva_spec
 from cat3d_core.seva.model import load_seva_model
-from flows.jobs.scene import file_sha256
-from schemas.content_key import content_key
+from schemas.content_key import content_key, file_sha256
 
 LOOKS_FOR = (
     f"SEVA's {' or '.join(FILE_NAMES)}, or the folder with it, in which also are vae/ (Stable Diffusion 2.1's "
@@ -27,10 +27,21 @@ def recognises(path: Path) -> bool:
 def describe(path: Path | None) -> GeneratorSpec:
     """What the network is; its identity is that of all three models' files. Raises ValueError where one is missing."""
     weights, autoencoder, tower = _parts(path)
-    encoder = content_key(files=[file_sha256(file) for file in sorted(autoencoder.iterdir()) if file.is_file()])
-    identity = content_key(weights=file_sha256(weights), encoder=encoder, tower=file_sha256(tower))
+    encoder = content_key(files=[_digest(file) for file in sorted(autoencoder.iterdir()) if file.is_file()])
+    identity = content_key(weights=_digest(weights), encoder=encoder, tower=_digest(tower))
     beside = sum(file.stat().st_size for file in (*autoencoder.glob("*.safetensors"), tower))
     return seva_spec(read_config(weights), identity, encoder, beside)
+
+
+def _digest(file: Path) -> str:
+    status = file.stat()
+    return _hashed(file, status.st_mtime_ns, status.st_size)
+
+
+@functools.lru_cache(maxsize=16)
+def _hashed(file: Path, _changed: int, _size: int) -> str:
+    """Once in a process: together the files have ten gigabytes."""
+    return file_sha256(file)
 
 
 def load(path: Path | None, device: str, precision: str) -> Generator:

@@ -1,5 +1,5 @@
 // Turns scenes of splats in the page itself: every <canvas class="splats"> has its splats (the 32 bytes each of a .splat
-// file, base64) and its cameras (JSON) in the elements that its data-splats and data-cameras name. z is up.
+// file, base64), and its cameras and points (JSON), in the elements that its data-splats and data-cameras name. z is up.
 "use strict";
 (() => {
   const VERTEX = `#version 300 es
@@ -45,6 +45,7 @@
     void main() {
       vec3 p = (view * vec4(point, 1.0)).xyz;
       tint = shade;
+      gl_PointSize = 3.0;
       gl_Position = vec4(2.0 * focal * p.xy / size * vec2(1.0, -1.0), 0.0, p.z);
     }`;
   const LINE_FRAGMENT = `#version 300 es
@@ -96,7 +97,7 @@
         for (let j = 0; j < 4; ++j) shades.push(...colour);
       });
     }
-    return [new Float32Array(points), new Float32Array(shades)];
+    return [points, shades];
   }
 
   class Scene {
@@ -106,7 +107,8 @@
       if (!gl) throw new Error("This browser has no WebGL 2.");
       const splats = texels(bytesOf(document.getElementById(canvas.dataset.splats).textContent.trim()));
       Object.assign(this, splats);
-      this.cameras = JSON.parse(document.getElementById(canvas.dataset.cameras).textContent);
+      const drawn = JSON.parse(document.getElementById(canvas.dataset.cameras).textContent);
+      this.cameras = drawn.cameras;
       this.drawing = program(gl, VERTEX, FRAGMENT);
       const texture = gl.createTexture();
       gl.bindTexture(gl.TEXTURE_2D, texture);
@@ -115,11 +117,12 @@
       this.corners = this.buffer(new Float32Array([-2, -2, 2, -2, 2, 2, -2, 2]));
       this.order = gl.createBuffer();
       this.lines = program(gl, LINE_VERTEX, LINE_FRAGMENT);
-      const [points, shades] = frusta(this.cameras, 0.12);
-      this.ends = points.length / 3;
-      this.points = this.buffer(points);
-      this.shades = this.buffer(shades);
-      this.frusta = true;
+      // Ends of lines first, then single points.
+      const [ends, shades] = frusta(this.cameras, 0.12), dots = drawn.points.flat();
+      [this.ends, this.dots] = [ends.length / 3, dots.length / 3];
+      this.points = this.buffer(new Float32Array([...ends, ...dots]));
+      this.shades = this.buffer(new Float32Array([...shades, ...dots.fill(0.9)]));
+      [this.frusta, this.cloud] = [true, false];
       this.home();
       this.listen();
     }
@@ -197,6 +200,7 @@
       }, {passive: false});
       canvas.addEventListener("keydown", event => {
         if (event.key === "c") { this.frusta = !this.frusta; this.redraw(); }
+        if (event.key === "p") { this.cloud = !this.cloud; this.redraw(); }
       });
     }
 
@@ -233,12 +237,12 @@
       this.attribute(this.drawing, "corner", this.corners, 2, 0);
       this.attribute(this.drawing, "index", this.order, 1, 1, true);
       gl.drawArraysInstanced(gl.TRIANGLE_FAN, 0, 4, this.count);
-      if (this.frusta && !this.pose) {
-        settings(this.lines);
-        this.attribute(this.lines, "point", this.points, 3, 0);
-        this.attribute(this.lines, "shade", this.shades, 3, 0);
-        gl.drawArrays(gl.LINES, 0, this.ends);
-      }
+      if (this.pose) return;
+      settings(this.lines);
+      this.attribute(this.lines, "point", this.points, 3, 0);
+      this.attribute(this.lines, "shade", this.shades, 3, 0);
+      if (this.frusta) gl.drawArrays(gl.LINES, 0, this.ends);
+      if (this.cloud) gl.drawArrays(gl.POINTS, this.ends, this.dots);
     }
 
     // Farthest first: by counting, over 65,536 depths.

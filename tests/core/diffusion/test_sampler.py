@@ -123,7 +123,7 @@ def test_a_network_that_knows_the_answer_gives_it():
     truth = torch.randn_like(noise)
 
     class Exact(torch.nn.Module):
-        def forward(self, x, time, cameras, mask):
+        def forward(self, x, time, cameras, mask, hints=None):
             # With exact predictions x stays on alpha clean + sigma noise: read the two amplitudes off it.
             basis = torch.stack([truth.flatten(), noise.flatten()], 1).double()
             alpha, sigma = torch.linalg.lstsq(basis, x[:, 3:].flatten()[:, None].double()).solution[:, 0].tolist()

@@ -38,7 +38,7 @@ def test_loss_is_on_targets_only_with_clean_conditioning():
     seen = {}
 
     class Spy(torch.nn.Module):
-        def forward(self, x, time, cameras, mask):
+        def forward(self, x, time, cameras, mask, hints=None):
             seen.update(x=x, mask=mask, cameras=cameras)
             out = torch.zeros_like(x)
             out[:, :3] = 1e6  # whatever the network says about conditioning views does not count
@@ -96,7 +96,7 @@ def test_state_of_another_network_is_refused():
         ).load_state(state)
 
 
-@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+@pytest.mark.parametrize("precision", ["float32", pytest.param("bfloat16", marks=pytest.mark.slow)])
 def test_it_learns_a_constant(precision):
     """One picture repeated: the loss (1 at the start, when the network says zero) falls, and the average follows."""
     config = TrainConfig(
@@ -142,6 +142,7 @@ def _rank(rank: int, folder: str) -> None:
     torch.distributed.destroy_process_group()
 
 
+@pytest.mark.slow
 def test_ranks_stay_equal_and_average_their_gradients(tmp_path):
     torch.multiprocessing.spawn(_rank, (str(tmp_path),), nprocs=2)
     first, second = (load_state(tmp_path / f"{r}.safetensors")[0] for r in (0, 1))

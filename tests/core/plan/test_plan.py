@@ -43,13 +43,15 @@ def sizes(plan: Plan) -> list[int]:
     return [len(group.targets) for group in plan.groups]
 
 
+@pytest.mark.parametrize("count", [60, pytest.param(None, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", sorted(FAMILIES))
-def test_few_view_plans_of_each_family(name: str) -> None:
+def test_few_view_plans_of_each_family(name: str, count: int | None) -> None:
+    """Of 60 views, and of as many as the paper's, which is up to 960."""
     captured = FAMILIES[name]()
-    plan = make_plan(captured, PlanConfig(image_size=64))
+    plan = make_plan(captured, PlanConfig(count=count, image_size=64))
     check(plan)
     assert plan.recipe == name
-    assert len(plan) == RECIPES[name].count
+    assert len(plan) == (count or RECIPES[name].count)
     assert sizes(plan) == [5] * (len(plan) // 5)
     assert plan.condition.shape == (len(plan), 3)
     assert (plan.condition < len(captured)).all()
@@ -207,7 +209,8 @@ def test_a_path_can_be_fitted_to_more_views_than_are_captured() -> None:
     assert alone.recipe == "co3d"  # three views on an arc of 60 degrees
     assert fitted.recipe == "mipnerf360"
     whole = make_plan(everything, PlanConfig(count=60, image_size=32))
-    assert torch.equal(fitted.cameras.world_from_camera, whole.cameras.world_from_camera)
+    # Not to the bit: the last one of a sum depends on where in memory its terms lie.
+    torch.testing.assert_close(fitted.cameras.world_from_camera, whole.cameras.world_from_camera, rtol=0, atol=1e-12)
     assert fitted.captured_count == 3
     assert fitted.condition.max() == 2
 

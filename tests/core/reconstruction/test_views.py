@@ -98,3 +98,19 @@ def test_moving_and_masking_keep_all_maps() -> None:
 def test_a_map_that_does_not_fit_is_refused(maps: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         random_views(**maps)
+
+
+def test_the_pixels_that_count_are_found_by_their_number() -> None:
+    """Against the list of all of them, with views of odd sizes, empty ones, and blocks of which no pixel counts."""
+    sizes = [(7, 5), (40, 33), (1, 1), (64, 2), (9, 9)]
+    generator = torch.Generator().manual_seed(1)
+    masks = [torch.rand((h, w), generator=generator) < share for (w, h), share in zip(sizes, (0.5, 0.03, 1, 0, 1))]
+    cameras = Cameras(torch.eye(3).expand(5, 3, 3), torch.eye(4).expand(5, 4, 4), torch.tensor(sizes))
+    images = (torch.zeros((h, w, 3), dtype=torch.uint8) for w, h in sizes)
+    views = Views.from_images(cameras, images, torch.ones(5, dtype=torch.bool), masks)
+    assert views.counting.tolist() == [int(mask.sum()) for mask in masks]
+    for view, mask in enumerate(masks):
+        rows, columns = mask.nonzero(as_tuple=True)
+        number = torch.arange(len(rows))
+        xy = views.pixel(torch.full_like(number, view), number)
+        assert torch.equal(xy, torch.stack([columns, rows], -1))

@@ -95,10 +95,10 @@ def test_other_files_are_no_seva(tmp_path):
 
 
 def test_training_does_not_start_from_seva(file, tmp_path):
-    """Also where a program has put its prefix before the names."""
+    """Nor from its folder, nor where a program has put its prefix before the names."""
     prefixed = {f"model.diffusion_model.{name}": t for name, t in load_file(file).items()}
     save_file(prefixed, tmp_path / "prefixed.safetensors")
-    for path in (file, tmp_path / "prefixed.safetensors"):
+    for path in (file, file.parent, tmp_path / "prefixed.safetensors"):
         with pytest.raises(ValueError, match="Stability AI Non-Commercial License"):
             load_stable_diffusion(path)
 

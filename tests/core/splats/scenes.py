@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from cat3d_core.cameras import Cameras
-from cat3d_core.splats.gaussians import Gaussians, rotation_matrices
+from cat3d_core.quaternions import rotation_matrices
+from cat3d_core.splats.gaussians import Gaussians
 
 
 def camera(width: int = 45, height: int = 37) -> Cameras:

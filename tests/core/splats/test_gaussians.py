@@ -9,14 +9,12 @@ import torch
 from torch.nn.functional import normalize
 
 from cat3d_core.normalization import Similarity
+from cat3d_core.quaternions import quaternion_product, quaternions_from_rotations, rotation_matrices
 from cat3d_core.splats.gaussians import (
     SH_0,
     Gaussians,
     basis,
     harmonics_of_colour,
-    quaternion_product,
-    quaternions_from_rotations,
-    rotation_matrices,
 )  # fmt: skip
 from cat3d_core.splats.rasterize import rasterize
 from tests.core.splats.scenes import camera, gaussians

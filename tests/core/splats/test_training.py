@@ -273,6 +273,8 @@ def test_cameras_between_others_look_where_both_look() -> None:
     every = between(cameras, 24)
     assert len(every) == 24
     assert len(between(cameras, 6)) == 6
+    assert len(between(cameras[:2], 40)) == 40  # between what is between, too
+    between(cameras[:2], 40).validate()
     assert len(between(cameras[0], 6)) == 1
     torch.testing.assert_close(every[:10].world_from_camera, cameras.world_from_camera.double())
     every.validate()

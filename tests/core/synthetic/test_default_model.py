@@ -1,5 +1,6 @@
 """The shipped model: present, whole, small enough, and better than noise on a held-out scene."""
 
+import pytest
 import torch
 
 from cat3d_core.diffusion import describe, load_model
@@ -19,6 +20,7 @@ def test_it_says_what_it_is_and_fits_the_budget():
     assert sum(f.stat().st_size for f in path.parent.glob("*.safetensors")) <= 48_000_000
 
 
+@pytest.mark.slow
 def test_its_samples_follow_the_views_given():
     """Against the flat mean colour of the views given, which is what a model that ignores cameras could reach."""
     generator = Cat3dGenerator(load_model(default_model_path()))

@@ -51,7 +51,7 @@ def test_a_skip_that_is_off_changes_no_bit(unused: dict) -> None:
 
 
 def test_front_to_back_loses_less_than_its_bound() -> None:
-    trainer = _trained(30)
+    trainer = _trained(12)
     with torch.no_grad():
         trainer.field.grids[-1].density.bias += 4.0  # type: ignore[operator]  # solid surfaces
     rays = image_rays(trainer.views.cameras, 0)
@@ -103,13 +103,14 @@ def test_all_rays_may_end_in_the_first_group() -> None:
 
 
 def test_front_to_back_trains_as_well() -> None:
-    plain, skipping = _trained(30), _trained(30, skip_transmittance=0.01)
+    plain, skipping = _trained(12), _trained(12, skip_transmittance=0.01)
     assert skipping.step()["psnr"] == pytest.approx(plain.step()["psnr"], abs=1.0)
-    again = _trained(30, skip_transmittance=0.01)
+    again = _trained(12, skip_transmittance=0.01)
     again.step()
     assert all(torch.equal(value, skipping.state()[name]) for name, value in again.state().items())
 
 
+@pytest.mark.slow
 def test_perceptual_loss_at_every_kth_step_keeps_its_weight_in_expectation() -> None:
     every, third = (_trained(0, perceptual=True, lpips_every=k, lpips_weight=0.2, lr_init=1e-9, lr_final=1e-9)
                     for k in (1, 3))  # fmt: skip

@@ -13,7 +13,8 @@ import pytest
 from flows.bench import store
 from flows.bench.fronts import cell, drawn_panels, pareto_front, verdict
 from flows.bench.page import read_benches, tables, worth_showing, write_page
-from flows.bench.registry import BENCHES, Bench, MissingError, Panel
+from flows.bench.registry import BENCHES, Bench, Panel
+from flows.bench.rows import MissingError
 from flows.commands import bench as bench_command
 from flows.errors import InputError
 from schemas.errors import StoreError

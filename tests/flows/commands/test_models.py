@@ -16,3 +16,9 @@ def test_the_model_and_the_plane_sweep_are_listed(capsys: pytest.CaptureFixture[
     assert {str(default_model_path()), str(default_sweep_path())} <= set(reports)
     sweep = reports[str(default_sweep_path())]
     assert {"config", "composite", "provenance", "sha256", "bytes"} <= set(sweep)
+
+
+def test_lists_of_settings_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    """Not read as markup: [false, true] would be a style of rich's and vanish."""
+    models_command(None, None, False)
+    assert '"attention": [' in " ".join(capsys.readouterr().out.replace("│", " ").split())

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from cat3d_core.splats.gaussians import Gaussians, rotation_matrices
+from cat3d_core.quaternions import rotation_matrices
+from cat3d_core.splats.gaussians import Gaussians
 from cat3d_core.splats.rasterize import rasterize
 from flows.errors import InputError
 from flows.exports.splat_files import (
@@ -90,6 +91,23 @@ def test_gsply_reads_the_same_numbers(tmp_path: Path, suffix: str) -> None:
     torch.testing.assert_close(torch.from_numpy(read.sh0).reshape(-1, 3), g.harmonics[:, 0], rtol=0, atol=0.0141)
     rotations = rotation_matrices(torch.from_numpy(read.quats))
     torch.testing.assert_close(rotations, turn @ g.rotations, rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize("suffix", [".splat", ".spz"])
+def test_gaussforge_reads_the_same_numbers(tmp_path: Path, suffix: str) -> None:
+    """It rewrites a file as .ply, in the file's own order, and leaves axes as the file has them."""
+    gaussforge = pytest.importorskip("gaussforge")
+    path = tmp_path / f"a{suffix}"
+    WRITERS[suffix](path, some())
+    found = gaussforge.GaussForge().convert(path.read_bytes(), suffix[1:], "ply")
+    (tmp_path / "read.ply").write_bytes(found["data"])
+    theirs, ours = read_ply(tmp_path / "read.ply"), READERS[suffix](path)
+    turn = torch.diag(torch.tensor([1.0, -1.0, -1.0])) if suffix == ".spz" else torch.eye(3)
+    torch.testing.assert_close(theirs.means, ours.means @ turn, rtol=0, atol=0)
+    torch.testing.assert_close(theirs.log_scales, ours.log_scales, rtol=0, atol=1e-6)
+    torch.testing.assert_close(theirs.opacities, ours.opacities, rtol=0, atol=1e-6)
+    torch.testing.assert_close(theirs.harmonics, ours.harmonics, rtol=0, atol=1e-6)
+    torch.testing.assert_close(theirs.rotations, turn @ ours.rotations, rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize("degree", DEGREES)

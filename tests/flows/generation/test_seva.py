@@ -134,7 +134,7 @@ def test_too_little_memory_is_a_sentence(model: Path, tmp_path: Path, monkeypatc
     given, settings = {"method": "cat3d", "model": str(model)}, ["execution={workers: 2, groups_at_once: 4}"]
     with pytest.raises(InputError, match=r"Memory is too small: each of 2 workers needs .* What helps: execution") as e:
         run_command(make_request(SCENE, tmp_path, "3", given, settings=settings))
-    assert "sample.precision=bfloat16" in str(e.value)
+    assert "sample.precision=bfloat16, a smaller plan.window or plan.image_size, a device" in str(e.value)
 
 
 def test_settings_that_windows_do_not_have_are_refused(cat3d, model: Path, tmp_path: Path) -> None:

@@ -98,26 +98,30 @@ def test_settings_of_the_command_line_are_those_of_all_runs(tmp_path: Path) -> N
     assert sweep_of(workers=3).base["execution"] == {"workers": 3}, "short for it"
 
 
-def test_results_name_regressions_beyond_the_bound(tmp_path: Path) -> None:
+def test_results_name_regressions_that_seeds_do_not_explain(tmp_path: Path) -> None:
     row = {"scene_id": "a", "run": "v3-zipnerf", "key": "k", "protocol": "google", "view": 0, "width": 8, "height": 8,
-           "psnr_db": 20.0, "ssim": 0.5, "lpips": 0.3, "lpips_backbone": "lpips-vgg", "method": "zipnerf"}  # fmt: skip
-    for name, changes in {"old": {}, "worse": {"psnr_db": 19.8}, "fine": {"psnr_db": 19.95, "ssim": 0.6},
+           "ssim": 0.5, "lpips": 0.3, "lpips_backbone": "lpips-vgg", "method": "zipnerf", "split": "3"}  # fmt: skip
+    for name, changes in {"old": {}, "worse": {"shift": -1.0}, "noise": {"shift": -0.05}, "better": {"shift": 1.0},
                           "other": {"lpips": 0.9, "lpips_backbone": "st-lpips-alex"}}.items():  # fmt: skip
-        append_rows(tmp_path / name / "metrics", metric_table(), [row | changes], "a")
-    assert compare(tmp_path / "worse", tmp_path / "old", 0.1, 0.01) == 1
-    assert compare(tmp_path / "fine", tmp_path / "old", 0.1, 0.01) == 0
-    assert compare(tmp_path / "other", tmp_path / "old", 0.1, 0.01) == 0
+        shift = float(changes.pop("shift", 0.0))  # type: ignore[arg-type]
+        seeds = [{"run": f"v3-zipnerf-s{s}", "seed": s, "psnr_db": 20.0 + 0.1 * s + shift} for s in range(5)]
+        append_rows(tmp_path / name / "metrics", metric_table(), [row | changes | seed for seed in seeds], "a")
+    counts = {name: compare(tmp_path / name, tmp_path / "old") for name in ("old", "worse", "noise", "better", "other")}
+    assert counts == {"old": 0, "worse": 1, "noise": 0, "better": 0, "other": 0}
 
 
-def test_results_command_exits_1_on_a_regression_only(tmp_path: Path) -> None:
-    row = {"scene_id": "a", "run": "v3-zipnerf", "key": "k", "protocol": "google", "view": 0, "width": 8, "height": 8,
-           "psnr_db": 20.0, "ssim": 0.5, "method": "zipnerf"}  # fmt: skip
-    for name, psnr in {"old": 20.0, "worse": 19.8}.items():
-        append_rows(tmp_path / name / "metrics", metric_table(), [row | {"psnr_db": psnr}], "a")
-    old, worse = str(tmp_path / "old"), str(tmp_path / "worse")
+def test_results_command_exits_1_on_a_regression_only(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    row = {"scene_id": "a", "key": "k", "protocol": "google", "view": 0, "width": 8, "height": 8, "split": "3",
+           "ssim": 0.5, "method": "zipnerf"}  # fmt: skip
+    for name, values in {"old": [20.0, 20.1], "worse": [15.0, 15.1], "one": [15.0]}.items():
+        rows = [row | {"psnr_db": value, "seed": s, "run": f"v3-s{s}"} for s, value in enumerate(values)]
+        append_rows(tmp_path / name / "metrics", metric_table(), rows, "a")
+    old, worse, one = (str(tmp_path / name) for name in ("old", "worse", "one"))
     for arguments, code in {(old,): 0, (worse, "--against", old): 1, (old, "--against", worse): 0,
-                            (worse, "--against", old, "--bound", "0.5"): 0}.items():  # fmt: skip
+                            (one, "--against", old): 0}.items():  # fmt: skip
         assert CliRunner().invoke(app, ["results", *arguments]).exit_code == code
+    assert compare(tmp_path / "one", tmp_path / "old") == 0
+    assert "one seed cannot tell whether that is noise" in " ".join(capfd.readouterr().out.split())
 
 
 def test_open_jobs_is_empty_only_when_everything_is_stored(tmp_path: Path, prefect_url: str) -> None:

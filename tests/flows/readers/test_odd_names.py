@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from flows.jobs.job import Job
-from flows.jobs.scene import capture_digests
 from flows.media.images import write_png
 from flows.readers import read_capture
 from flows.stages import ingest
@@ -82,7 +81,8 @@ def test_folders_of_any_name_go_into_the_store(tmp_path, name, odd):
     if name in ("transforms", "dtu"):  # the others differ in reading alone
         store = SceneStore.create(job.store_path, capture.scene_id, capture.dataset, {"source": "x"})
         views = [ingest.ingest_view(capture, v, job.config.ingest) for v in range(COUNT)]
-        ingest.write_captured(store, capture, capture_digests(capture)["images"], views)
+        job.scene.__dict__["capture"] = capture
+        ingest.write_captured(store, capture, job, views)
         assert [str(n) for n in store.captured.read("name")] == capture.names
         assert store.captured.attrs["title"] == capture.title
 

@@ -72,7 +72,7 @@ def test_a_strangers_reconstructor_and_metric_reach_the_report(tmp_path: Path, m
     assert rows.schema.field("brightness_error").metadata[b"meaning"] == b"difference of mean brightness"
     [summary] = summary_rows(out)
     assert summary["brightness_error"] == pytest.approx(np.mean(rows["brightness_error"].to_pylist()))
-    assert compare(out, out, 0.1, 0.01) == 0
+    assert compare(out, out) == 0
     page = write_report(out)
     assert "<th>brightness</th>" in page.read_text()
     assert f"{summary['brightness_error']:.3f}" in page.read_text()

@@ -24,7 +24,7 @@ def test_the_winner_is_that_of_scenes_which_both_methods_did() -> None:
     assert [(s.method, s.psnr_db, s.seconds, s.best_on) for s in answer.standings] == [
         ("cat3d", 22.0, 40.0, 1), ("zipnerf", 21.0, 6.0, 1),
     ]  # fmt: skip
-    assert answer.gain_db == pytest.approx(1.0)
+    assert answer.gain_db.value == pytest.approx(1.0)
     for part in ("cat3d beats zipnerf by 1.0 dB", "22.00 against 21.00", "best on 1 of 2", "40 s against 6 s"):
         assert part in answer.sentence
 
@@ -37,6 +37,17 @@ def test_equal_methods_a_single_one_and_nothing() -> None:
     assert answers([]) == []
     assert answers([row("a", "zipnerf", None)]) == []
     assert answers([row("a", "zipnerf", 20.0), row("b", "cat3d", 20.0)]) == [], "no scene in common"
+
+
+def test_more_seeds_say_whether_a_gain_is_noise() -> None:
+    def rows(gains: list[float]) -> list[dict]:
+        pairs = [(row("a", "zipnerf", 20.0 + 0.2 * s, seed=s), row("a", "cat3d", 20.0 + 0.2 * s + gain, seed=s))
+                 for s, gain in enumerate(gains)]  # fmt: skip
+        return [one for pair in pairs for one in pair]
+
+    assert "cat3d beats zipnerf by 2.0 ± 0.2 dB" in answers(rows([2.0] * 5))[0].sentence
+    assert "cat3d and zipnerf are equal within the noise of seeds" in answers(rows([0.2] * 5))[0].sentence
+    assert "one seed does not say how much of that is noise" in answers(rows([2.0]))[0].sentence
 
 
 def test_a_scene_counts_once_however_many_seeds_it_has() -> None:

@@ -67,7 +67,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
         job = run("covered", "plan", none | {"covered_path": True}, "plan.views=20")
     write_report(out)
     assert "Skipped, and what it saved" in (out / "report.html").read_text()
-    return skipped_work([scene_section(out, job.store_path)])
+    return skipped_work([scene_section(out, job.store_path, [])])
 
 
 @pytest.mark.slow

@@ -6,10 +6,15 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
+from cat3d_core.cameras import Cameras
+from cat3d_core.reconstruction import Views
+from flows.generation import brief
 from flows.jobs.request import make_request
 from flows.media.images import write_png
 from flows.pipeline.runner import opened, run_missing
+from flows.readers import read_capture
 from flows.stages.training_views import training_views
 from schemas.scene_store import SceneStore
 from tests.flows.readers.layouts import LAYOUTS
@@ -42,3 +47,37 @@ def test_which_pixels_are_trained_on(tmp_path, layout):
     whole = layout == "dtu"
     assert views.counting.tolist() == [64 * (48 if whole else 12)] * len(job.split["train"])
     assert any("masks" in d.text for d in decisions) != whole
+
+
+def test_masks_of_instant_ngp_are_said_to_be_left_out(tmp_path):
+    cameras = small_cameras(64, 48)
+    scene = LAYOUTS["transforms"](tmp_path / "scene", cameras, drawn(cameras), NAMES)
+    photo = next(path for path in scene.rglob(NAMES[1]))
+    write_png(photo.with_name(f"dynamic_mask_{photo.stem}.png"), np.zeros((48, 64), np.uint8))
+    capture = read_capture(scene)
+    assert len(capture) == COUNT
+    (note,) = (note for note in capture.notes if "dynamic_mask_" in note)
+    assert "of 1 photos) are not read" in note
+
+
+def test_brief_fields_heed_masks_too(tmp_path, monkeypatch):
+    """What decides on rounds and on pixels that photos show is trained on the same pixels as the field itself."""
+    size = torch.tensor([[6, 4], [6, 4]])
+    cameras = Cameras(torch.eye(3).expand(2, 3, 3), torch.eye(4).expand(2, 4, 4), size)
+    mask = torch.arange(24).reshape(4, 6) % 3 > 0
+    photos = [torch.zeros(4, 6, 3, dtype=torch.uint8) for _ in range(2)]
+    views = Views.from_images(cameras, photos, torch.tensor([True, False]), [mask, None])
+    seen = []
+
+    def stop(job, views):
+        seen.append(views)
+        raise InterruptedError
+
+    monkeypatch.setattr(brief, "brief_reconstruction", stop)
+    with pytest.raises(InterruptedError):
+        brief.shown_by_captured(None, views)
+    assert torch.equal(seen[0].map(seen[0].valid, 0), mask)
+    whole = Views.from_images(cameras, photos, torch.tensor([True, False]), weights=[None, mask.float()])
+    with pytest.raises(InterruptedError):
+        brief.shown_by_captured(None, whole)
+    assert seen[1].valid is None  # as before there were masks: the same rays are drawn

@@ -75,7 +75,7 @@ def test_views_are_photos_where_they_show_the_place_and_samples_elsewhere(tmp_pa
     records = run_stages(one, *UP_TO_DECODE)
     assert records["match"].work["views"] == VIEWS
     run = run_of(one)
-    assert not explained_views(run).any()
+    assert not explained_views(one, run).any()
     generator, network = open_generator(one), open_sweep(one)
     for view in (0, VIEWS - 1):
         hint, sample = read_hint(run, view), decoded(generator, run.generated, view)
@@ -99,7 +99,7 @@ def test_a_view_that_photos_show_wholly_is_not_sampled(tmp_path: Path, model: Pa
     one = job(tmp_path / "out", model, "hints.use=always", f"hints.checkpoint={sweep}")
     records = run_stages(one, *UP_TO_DECODE)
     run = run_of(one)
-    assert explained_views(run).all()
+    assert explained_views(one, run).all()
     assert records["sample"].work["evaluations"] == 0
     saved = [d for d in records["sample"].decisions if d.switch == "explained"]
     plan = StoredPlan(SceneStore.open(one.store_path), run, 0)
@@ -111,6 +111,24 @@ def test_a_view_that_photos_show_wholly_is_not_sampled(tmp_path: Path, model: Pa
     assert np.array_equal(run.generated.read("image"), run.section("hints").read("colour"))
 
 
+def test_a_model_that_takes_hints_is_given_them(tmp_path: Path) -> None:
+    sweep = sweep_file(tmp_path / "sweep.safetensors")
+    model = random_model(tmp_path / "hinted.safetensors", hints=True)
+    one = job(tmp_path / "out", model, "hints.use=always", f"hints.checkpoint={sweep}", "sample.start=hint")
+    run_stages(one, *UP_TO_DECODE)
+    store, run = SceneStore.open(one.store_path), run_of(one)
+    plan = StoredPlan(store, run, 0)
+    group = plan.view_group(plan.groups[0], open_generator(one))
+    targets = plan.groups[0].targets
+    assert group.hints["colour"].shape == (len(targets), 3, 64, 64)
+    for i, view in enumerate(targets):
+        hint = read_hint(run, view)
+        assert torch.equal(group.hints["colour"][i], hint.colour.permute(2, 0, 1) / 255)
+        assert torch.equal(group.hints["confidence"][i], hint.confidence)
+    without = job(tmp_path / "out", model, "hints.use=never")
+    assert not StoredPlan(store, run, 0, hinted=without.hinted).view_group(plan.groups[0], open_generator(one)).hints
+
+
 def test_anchors_of_a_single_photo_are_always_sampled(tmp_path: Path, model: Path) -> None:
     sweep = sweep_file(tmp_path / "sweep.safetensors", Composite(-1.0, 0.01))
     one = job(tmp_path / "out", model, "hints.use=always", f"hints.checkpoint={sweep}", split="1")
@@ -118,7 +136,7 @@ def test_anchors_of_a_single_photo_are_always_sampled(tmp_path: Path, model: Pat
     run = run_of(one)
     anchors = run.plan.read("anchor")
     assert anchors.any()
-    assert not explained_views(run)[anchors].any()
+    assert not explained_views(one, run)[anchors].any()
     assert run.generated.read("done_latent").any(-1)[anchors].all()
 
 

@@ -36,13 +36,15 @@ from schemas.errors import ConfigError
 from schemas.scene_store import SceneStore
 from schemas.skip import SkipConfig
 from schemas.stages import StageRecord
-from tests.flows.workers.scene import VIEWS, random_model, run_of, run_stages
+from tests.flows.workers.scene import random_model, run_of, run_stages
 
 SOURCE = "procedural:dtu/3?views=9&width=32&height=24"
 SMALL = (
     "reconstruct.overrides={iterations: 6, batch_rays: 64, samples: [8, 8], grid_max: [32, 64], grid_features: [1, 2], \
 interlevel_blur: [0.03], grid_log2_table: 10, warmup_iterations: 2, lpips_weight: 0.0}"
 )
+#: Generated views: three groups.
+VIEWS = 12
 UP_TO_FIELD = ("ingest", "poses", "plan", "encode", "sample", "decode", "reconstruct")
 
 
@@ -176,8 +178,8 @@ def test_a_covered_path_is_not_sampled_decoded_or_missed(model: Path, tmp_path: 
     one = job(tmp_path, model)
     records = run_stages(one, *UP_TO_FIELD)
     assert any("need not be generated" in d.text for d in records["plan"].decisions)
-    assert any("24 of 24 planned views were left out" in d.text for d in records["sample"].decisions)
-    assert any("Skipped decoding 24 of 24" in d.text for d in records["decode"].decisions)
+    assert any(f"{VIEWS} of {VIEWS} planned views were left out" in d.text for d in records["sample"].decisions)
+    assert any(f"Skipped decoding {VIEWS} of {VIEWS}" in d.text for d in records["decode"].decisions)
     assert any("captured views alone" in d.text for d in records["reconstruct"].decisions)
     assert records["sample"].work["evaluations"] == 0
     assert records["reconstruct"].work["views"] == 3
@@ -203,7 +205,7 @@ def test_rounds_stop_when_the_held_out_view_no_longer_improves(model: Path, tmp_
     one = job(tmp_path, model, settings)
     records = run_stages(one, *UP_TO_FIELD)
     told = [d for d in texts(records["sample"]) if "ound" in d]
-    assert told[0].startswith("Round 1: with 2 more groups the held-out captured view went from ")
+    assert told[0].startswith("Round 1: with 1 more groups the held-out captured view went from ")
     assert "chosen for this scene in" in told[-1]
     used = len(list(generated_views(run_of(one))))
     assert records["reconstruct"].work["views"] == 3 + used
@@ -268,7 +270,9 @@ def test_generated_views_are_no_finer_than_the_photos_and_it_is_said(model: Path
     assert len(reduced.pixels) < len(whole.pixels)
 
 
-def test_what_captured_views_show_is_not_learned_from_generated_ones(model: Path, tmp_path: Path) -> None:
+def test_what_captured_views_show_is_not_learned_from_generated_ones(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     one = job(tmp_path, model, "skip={seen: true, covered_path: false, coverage: false}")
     records = run_stages(one, *UP_TO_FIELD)
     told = next(d for d in texts(records["reconstruct"]) if "captured views show their places" in d)
@@ -283,6 +287,15 @@ def test_what_captured_views_show_is_not_learned_from_generated_ones(model: Path
     most = views.only(views.captured.repeat_interleave(views.size.prod(-1)) | (torch.rand(len(views.pixels)) < 0.1))
     assert left_out(most) > 0.85
     assert fitted(trainer_config(one), most, {})[0].captured_share == left_out(most)
+    monkeypatch.setattr("flows.stages.training_views.ENOUGH", share - 0.01)
+    assert len(training_views(one, store, store.run(one.run))[0]) > 3, "three photos are too few for that"
+    monkeypatch.setattr("flows.stages.training_views.FEW", 2)
+    alone, decisions = training_views(one, store, store.run(one.run))
+    assert len(alone) == 3, "captured views show most of what the generated ones do: these are left out"
+    assert alone.valid is alone.weight is None, "and the captured ones are trained on as without them"
+    assert torch.equal(alone.pixels, views.pixels[: len(alone.pixels)])
+    assert decisions[-1].text.startswith("No generated view was trained on")
+    monkeypatch.undo()
     single = job(tmp_path / "single", model, "skip={seen: true}", split="1")
     told_of_one = texts(run_stages(single, *UP_TO_FIELD)["reconstruct"])
     assert not any("captured views show" in d for d in told_of_one), "one view alone has no depth"

@@ -134,6 +134,7 @@ def test_killed_and_resumed_equals_uninterrupted_to_the_bit(trained: Path, confi
     assert read_rows(tmp_path / "training", TRAINING)["step"].to_pylist() == [2, 4, 6, 8]
 
 
+@pytest.mark.slow
 def test_two_ranks_under_torchrun_share_a_training(trained: Path, config: Path, tmp_path: Path) -> None:
     torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m")
     arguments = (config, "--out", tmp_path, "--set", "bank.scenes=26", "--set", "bank.views=8", "--steps", "2")
@@ -309,13 +310,19 @@ def test_photographs_are_half_of_the_autoencoder_s_images() -> None:
 
 def test_jitter_scales_positions_and_keeps_directions() -> None:
     cameras = torch.rand(6, 8, 4, 4, dtype=torch.float64) + 0.1
-    out = jitter_scale(cameras, 1.5, torch.Generator().manual_seed(0))
+    hints = torch.rand(6, 5, 12, 2, 2) + 0.1
+    out, told = jitter_scale(cameras, 1.5, torch.Generator().manual_seed(0), hints)
     factor = out[:, :, :3, 3:] / cameras[:, :, :3, 3:]
     assert torch.equal(out[..., :3], cameras[..., :3])
     assert torch.equal(out[:, :, 3], cameras[:, :, 3])
     assert factor.min() >= 1 / 1.5 - 1e-6
     assert factor.max() <= 1.5 + 1e-6
     torch.testing.assert_close(factor, factor[:, :1, :1, :1].expand_as(factor))
+    assert told is not None
+    assert torch.equal(told[:, :, :10], hints[:, :, :10])
+    torch.testing.assert_close(
+        hints[:, :, 10:] / told[:, :, 10:], factor[:, :1, :1, :1, None].float().expand(6, 5, 2, 2, 2)
+    )
 
 
 def test_scores_tell_right_cameras_from_wrong_ones() -> None:

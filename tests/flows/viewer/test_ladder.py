@@ -13,7 +13,7 @@ import torch
 from cat3d_core.cameras import Cameras
 from cat3d_core.reconstruction import Render
 from cat3d_core.splats.rasterize import render
-from flows.viewer.ladder import Ladder, Picture, Wish, tiles
+from flows.viewer.ladder import Ladder, Picture, StoppedError, Wish, tiles
 from tests.core.splats.scenes import camera, gaussians
 
 
@@ -132,3 +132,30 @@ def test_a_scene_that_fails_does_not_stop_the_others(
     ladder.look(1, wish(Scene()))
     assert [shown.get(timeout=60)[0] for _ in range(4)] == [1] * 4
     assert "no view today" in capfd.readouterr().err
+
+
+def test_other_work_waits_for_the_coarse_pictures_and_ends_with_the_ladder(shown: Shown) -> None:
+    ladder, gate = Ladder(lambda who, asked, picture: shown.put((who, asked, picture))), threading.Semaphore(0)
+    done: queue.Queue[str] = queue.Queue()
+
+    def work() -> None:
+        try:
+            ladder.wait()
+            done.put("waited")
+            ladder.wait()
+        except StoppedError:
+            done.put("stopped")
+
+    ladder.look(0, wish(Scene(gate=gate)))
+    worker = threading.Thread(target=work, daemon=True)
+    worker.start()
+    for _ in range(4):  # one tile each of an eighth and a quarter, two of a half; none yet of the whole picture
+        gate.release()
+    assert [shown.get(timeout=60)[2].scale for _ in range(3)] == [1 / 8, 1 / 4, 1 / 2]
+    assert done.get(timeout=60) == "waited"
+    ladder.look(0, wish(Scene(gate=gate)))
+    for _ in range(100):
+        gate.release()
+    ladder.stop()
+    worker.join(timeout=60)
+    assert not worker.is_alive()

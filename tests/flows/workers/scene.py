@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from pathlib import Path
 from typing import Any
@@ -20,10 +21,12 @@ SOURCE = "procedural:dtu/3?views=9&width=32&height=24"
 VIEWS = 24
 
 
-def random_model(path: Path) -> Path:
-    """A tiny model with random weights, none of them zero, so that every input has an effect."""
+def random_model(path: Path, **unet: Any) -> Path:
+    """A tiny model with random weights, none of them zero, so that every input has an effect; unet: fields of its
+    configuration that differ."""
     torch.manual_seed(0)
-    model = MultiViewModel(SIZES["tiny"])
+    config = SIZES["tiny"]
+    model = MultiViewModel(dataclasses.replace(config, unet=dataclasses.replace(config.unet, **unet)))
     for weight in model.parameters():
         if not weight.abs().max():
             torch.nn.init.normal_(weight, 0, 0.02)
@@ -32,8 +35,8 @@ def random_model(path: Path) -> Path:
 
 
 def make_job(out: Path, checkpoint: Path, split: str = "3", count: int = VIEWS, **execution: Any) -> Job:
-    """A cat3d run of `count` views in 24 steps: long enough to be interrupted."""
-    document = [f"sample.checkpoint={checkpoint}", "sample.steps=24", f"plan.views={count}", "seed=5", "method=cat3d"]
+    """A cat3d run of `count` views in 12 steps: long enough to be interrupted."""
+    document = [f"sample.checkpoint={checkpoint}", "sample.steps=12", f"plan.views={count}", "seed=5", "method=cat3d"]
     settings = [*document, *(f"execution.{name}={value}" for name, value in execution.items())]
     return Request(SOURCE, out, (split,), make_config({}, None, settings)).jobs()[0]
 

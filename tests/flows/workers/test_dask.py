@@ -25,7 +25,8 @@ def cluster(prefect_url: str) -> Iterator[distributed.LocalCluster]:
         yield cluster
 
 
-@pytest.mark.parametrize("kind", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_lost_dask_workers_groups_are_taken_over(scene, expected, cluster, kind: signal.Signals) -> None:
     job = scene(
         executor="dask",

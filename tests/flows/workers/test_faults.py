@@ -106,7 +106,8 @@ def wait_for(condition: Callable[[], object], timeout_s: float = 60) -> None:
         time.sleep(0.02)
 
 
-@pytest.mark.parametrize("kind", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGKILL])
 def test_the_workers_end_with_their_parent_and_the_next_run_goes_on(scene, expected, kind) -> None:
     job = scene(workers=2, batch_seconds=0.1)  # a group a batch: some are left when the signal comes
     process = start(job)
