@@ -60,8 +60,8 @@ def perform(job: Job, step: Step) -> StageRecord:
 def scene_flow(scene_id: str, jobs: Sequence[Job]) -> list[StageRecord]:
     """All stages of all jobs of one scene that are not done yet. Returns the records of what ran; raises the first
     error, when what does not need that stage is done."""
-    results = run_jobs(jobs)
-    return [record for result in results for record in result.records_or_raise()]
+    records = [record for result in run_jobs(jobs) for record in result.records_or_raise()]
+    return list({id(record): record for record in records}.values())  # one that two runs waited for is in both
 
 
 def run_jobs(jobs: Sequence[Job], **options: Any) -> list[Result]:

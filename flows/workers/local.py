@@ -45,7 +45,7 @@ class LocalExecutor:
         if self.memory_gb is None or not out:
             return places
         free = self.memory_gb - sum(other.memory_gb * count for other, count in out.items())
-        return min(places, int(free / max(needs.memory_gb, 1e-3)))
+        return min(places, max(0, int(free / max(needs.memory_gb, 1e-3))))
 
     def wake(self) -> None:
         with contextlib.suppress(OSError):  # closed meanwhile

@@ -113,22 +113,23 @@ def test_a_failure_on_a_worker_ends_its_own_scene_alone_with_its_sentence(tmp_pa
     assert {row["scene_id"] for row in metrics_of(tmp_path / "out")} == {"good"}
 
 
-def jobs_of(out: Path, **changes: Any) -> list[Job]:
-    return sweep_jobs(sweep_of(SOURCE, **changes), out)[0][0]
+def jobs_of(out: Path, source: str = SOURCE, **changes: Any) -> list[Job]:
+    return sweep_jobs(sweep_of(source, **changes), out)[0][0]
 
 
 def test_runs_that_want_other_photos_of_a_scene_come_after_one_another(tmp_path: Path, prefect_url: str) -> None:
     methods = {"whole": {}, "half": {"ingest": {"downscale": 2}}, "again": {}}
-    jobs = jobs_of(tmp_path, methods=methods, base={"execution": {"workers": 2}})
+    source = "procedural:llff/2?views=9&width=48&height=40"
+    jobs = jobs_of(tmp_path, source, methods=methods, base={"execution": {"workers": 2}})
     keys = [shared_keys(job) for job in jobs]
     assert keys[0] == keys[2] != keys[1]
     assert len(scene_flow("s", jobs)) == 2 * 2 + 3 * 3, "the photos and cameras of two waves, and the stages of runs"
     assert len({record.key for record in scene_flow("s", jobs[1:2])}) <= 5
     store = SceneStore.open(jobs[0].store_path)
     assert [store.run(job.run).renders("test").read("image").shape[1:3] for job in jobs] == [
+        (40, 48),
         (20, 24),
-        (10, 12),
-        (20, 24),
+        (40, 48),
     ]
 
 
