@@ -45,10 +45,11 @@ UPDATE_S = 5.0
 
 
 def claim() -> None:
-    """Write down that the flow that calls this is this process's, and settle those of dead ones."""
+    """Write down that the flow that calls this is this process's, and settle those of dead ones. Outside of a flow
+    there is nothing to write down."""
     context = FlowRunContext.get()
     if context is None or context.flow_run is None:
-        raise RuntimeError("There is no flow whose process could be written down.")
+        return
     with get_client(sync_client=True) as client:
         client.update_flow_run(context.flow_run.id, infrastructure_pid=f"{platform.node()}:{os.getpid()}")
         settle(client)

@@ -183,7 +183,7 @@ def test_only_one_command_writes_a_store(tmp_path: Path) -> None:
         (["inspect", "/nonexistent.zarr"], 1, "does not exist"),
         (["sweep", "procedural", "--out", "s3://bucket/x"], 1, "s3://bucket/x is not on a file system"),
         (["reprocess", "gs://bucket"], 1, "gs://bucket is not on a file system"),
-        (["sweep", "procedural", "--set", "execution.workers=no"], 1, "execution.workers is 'no'"),
+        (["sweep", "procedural", "--set", "execution.workers=few"], 1, "execution.workers is 'few'"),
         (["run"], 2, "Give the scene's folder, or --prompt"),
         (["fly"], 2, "No such command"),
     ],
