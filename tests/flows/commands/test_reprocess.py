@@ -290,8 +290,9 @@ def test_old_results_stay_until_the_new_are_complete(root: Path, monkeypatch, pr
     replaced = (dataclasses.replace(s, execute=fail_in_the_second_run) if s.name == "render" else s for s in STAGES)
     monkeypatch.setattr("flows.pipeline.keys.STAGES", tuple(replaced))
     pictures = {p: p.read_bytes() for p in out.rglob("*.png")}
+    here = {"execution": {"workers": 1}}  # where the replaced stage is
     with pytest.raises(RuntimeError, match="midway"):
-        redo(find_stale(out, where=where)[0])
+        redo(find_stale(out, where=where, changes=here)[0])
     store = SceneStore.open(out / "room.zarr")
     assert np.array_equal(store.captured.read("image"), old_image)
     assert store.record("evaluate", "v3-zipnerf") is not None
