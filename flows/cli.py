@@ -16,17 +16,17 @@ from flows.cli_app import (
     ImagesOption,
     OutOption,
     ReaderOption,
+    ResultsOption,
     SeedOption,
     SetOption,
     app,
-    on_a_file_system,
 )
 
 
 @app.command()
 def run(
     source: Annotated[str, typer.Argument(help="A scene's folder, or just photos, or procedural:FAMILY/SEED.")] = "",
-    out: OutOption = Path("outputs"),
+    out: ResultsOption = Path("outputs"),
     prompt: Annotated[str, typer.Option(help="Text instead of a folder: what the scene's one photo shows.")] = "",
     text_to_image: Annotated[Path | None, typer.Option(help="Folder of a diffusers pipeline for --prompt.")] = None,
     text_settings: Annotated[str, typer.Option(help="Its settings, e.g. {steps: 20, guidance: 5, side: 512}.")] = "",
@@ -46,14 +46,16 @@ def run(
         raise typer.BadParameter("Give the scene's folder, or --prompt and --text-to-image.")
     from flows.commands.run import run_command
     from flows.jobs.request import make_request
+    from flows.object_storage import results_at
 
     given: dict[str, Any] = {"downscale": downscale, "method": method, "preset": preset, "seed": seed}
     given |= {"model": str(model.resolve())} if model else {}
-    if text_to_image is not None:
-        from flows.generation.text import make_prompt, text_to_photo
+    with results_at(out) as folder:
+        if text_to_image is not None:
+            from flows.generation.text import make_prompt, text_to_photo
 
-        source = str(text_to_photo(make_prompt(prompt, text_to_image, seed, text_settings), out.resolve()))
-    run_command(make_request(source, out, views, given, reader, images, config, set_ or []))
+            source = str(text_to_photo(make_prompt(prompt, text_to_image, seed, text_settings), folder.resolve()))
+        run_command(make_request(source, folder, views, given, reader, images, config, set_ or []))
 
 
 @app.command()
@@ -103,8 +105,10 @@ def inspect(
 ) -> None:
     """What a store holds: arrays, stages done, cameras, what is stale; or one array with its statistics."""
     from flows.commands.inspect import inspect_command
+    from flows.object_storage import results_at
 
-    inspect_command(store, array, verify, as_json, png)
+    with results_at(store, writes=False) as found:
+        inspect_command(found, array, verify, as_json, png)
 
 
 @app.command()
@@ -127,9 +131,11 @@ def export(
 ) -> None:
     """A finished run as a mesh (PLY, GLB), points, splats (PLY, SPLAT, SPZ), a data set, or renders along any path."""
     from flows.commands.export import SurfaceSettings, export_command
+    from flows.object_storage import results_at
 
     settings = SurfaceSettings(resolution, radius, opacity, views, scale, splats, refine)
-    export_command(store, run_name, what, out, frame, settings, path)
+    with results_at(store, writes=False) as found:
+        export_command(found, run_name, what, out, frame, settings, path)
 
 
 @app.command(name="import-views")
@@ -177,22 +183,26 @@ def models(
 @app.command()
 def sweep(
     config: Annotated[str, typer.Argument(help="A sweep's YAML file, or the name of a shipped one (see --list).")] = "",
-    out: OutOption = Path("outputs/sweep"),
+    out: ResultsOption = Path("outputs/sweep"),
     list_: Annotated[bool, typer.Option("--list", help="List the shipped sweeps.")] = False,
     settings: Annotated[Path | None, typer.Option("--config", help="Settings of all runs from a file.")] = None,
     set_: SetOption = None,
 ) -> None:
     """Benchmark sweep: scenes x training views x methods x seeds. Run again, it fills in what is missing."""
-    from flows.commands.sweep import sweep_command
+    from flows.commands.sweep import list_sweeps, sweep_command
+    from flows.object_storage import results_at
 
-    raise typer.Exit(sweep_command(config, out, list_, settings, set_ or []))
+    if list_ or not config:
+        list_sweeps()
+        return
+    with results_at(out) as folder:
+        problems = sweep_command(config, folder, settings, set_ or [])
+    raise typer.Exit(1 if problems else 0)
 
 
 @app.command()
 def reprocess(
-    out: Annotated[
-        Path, typer.Argument(help="The --out folder of an earlier run or sweep.", callback=on_a_file_system)
-    ],
+    out: Annotated[Path, typer.Argument(help="The --out folder of an earlier run or sweep.")],
     split: Annotated[str | None, typer.Option(help="Only runs with these training views, e.g. 3.")] = None,
     from_: Annotated[str | None, typer.Option("--from", help="Redo this stage and all after it.")] = None,
     where: Annotated[
@@ -205,9 +215,11 @@ def reprocess(
 ) -> None:
     """Redo what is stale after a change of images, cameras, splits, settings, code or model; nothing else."""
     from flows.commands.reprocess import reprocess_command
+    from flows.object_storage import results_at
     from schemas.settings import settings_document
 
-    problems = reprocess_command(out, split, from_, where or [], settings_document(set_ or []), dry_run)
+    with results_at(out, writes=not dry_run) as folder:
+        problems = reprocess_command(folder, split, from_, where or [], settings_document(set_ or []), dry_run)
     for sentence in problems:
         print(f"cat3d: {sentence}", file=sys.stderr)
     raise typer.Exit(1 if problems else 0)
@@ -223,8 +235,10 @@ def results(
 ) -> None:
     """Print an output folder's numbers and compare them with another's."""
     from flows.commands.results import results_command
+    from flows.object_storage import results_at
 
-    raise typer.Exit(1 if results_command(out, against) else 0)
+    with results_at(out, writes=False) as now, results_at(against or out, writes=False) as before:
+        raise typer.Exit(1 if results_command(now, before if against else None) else 0)
 
 
 import flows.cli_develop  # noqa: E402, F401  (registers its commands, after those above)

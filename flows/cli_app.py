@@ -17,16 +17,13 @@ app = typer.Typer(
 
 
 def on_a_file_system(path: Path) -> Path:
-    """The folder of results as it was given. Raises InputError for an address such as s3://bucket/folder."""
+    """The folder as it was given. Raises InputError for an address such as s3://bucket/folder."""
     from flows.errors import InputError
 
     if found := re.match(r"([a-zA-Z][a-zA-Z0-9+]+):/+", str(path)):
-        address = f"{found[1]}://{str(path)[found.end() :]}"
         raise InputError(
-            f"{address} is not on a file system. Results are replaced whole by renames and guarded by locks, which "
-            "object storage does not have: give a folder of this machine, or of a file system that all workers share, "
-            f"and copy it when the command is done (for S3: aws s3 sync FOLDER {address}). "
-            "docs/guides/cluster.md says more."
+            f"{found[1]}://{str(path)[found.end() :]} is not on a file system, and this command needs a folder that is."
+            " Commands that take s3://BUCKET/FOLDER: run, sweep, reprocess, results, inspect, export."
         )
     return path
 
@@ -34,6 +31,10 @@ def on_a_file_system(path: Path) -> Path:
 OutOption = Annotated[
     Path,
     typer.Option("--out", "-o", help="Folder for stores, tables, pictures and the report.", callback=on_a_file_system),
+]
+ResultsOption = Annotated[
+    Path,
+    typer.Option("--out", "-o", help="Folder for stores, tables, pictures and the report; also s3://BUCKET/FOLDER."),
 ]
 DownscaleOption = Annotated[
     float | None, typer.Option(help="Divide image width and height by this; without it, by what the preset can use.")

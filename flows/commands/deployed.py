@@ -16,6 +16,7 @@ from flows.commands.run import run_command
 from flows.commands.sweep import named_sweep, with_settings
 from flows.errors import WorkerError
 from flows.jobs.request import Request
+from flows.object_storage import results_at
 from flows.pipeline.sweep import run_sweep
 from schemas.config import RunConfig
 from schemas.execution import ExecutionConfig
@@ -23,7 +24,7 @@ from schemas.execution import ExecutionConfig
 StageName = Literal[
     "ingest", "poses", "plan", "match", "encode", "sample", "decode", "reconstruct", "render", "evaluate"
 ]
-Out = Annotated[Path, Field(title="Results", description="A folder on a file system that all workers share.")]
+Out = Annotated[Path, Field(title="Results", description="A folder that all workers share, or s3://BUCKET/FOLDER.")]
 Execution = Annotated[
     ExecutionConfig | None,
     Field(title="Where the work is done", description="Processes of the worker's machine, or a Dask cluster."),
@@ -42,7 +43,8 @@ def run(
     config: Annotated[RunConfig | None, Field(title="Settings", description="Of the run; none: defaults.")] = None,
 ) -> None:
     """Photos of one scene in, a 3D scene out: renders, metrics and a report. What is done already is not done again."""
-    run_command(Request(source, out.resolve(), tuple(views), config or RunConfig()))
+    with results_at(out) as folder:
+        run_command(Request(source, folder.resolve(), tuple(views), config or RunConfig()))
 
 
 @flow(name="sweep", flow_run_name="sweep {sweep}")
@@ -53,7 +55,8 @@ def sweep(
     settings: Further = None,
 ) -> None:
     """Benchmark sweep: scenes x training views x methods x seeds. Run again, it fills in what is missing."""
-    problems = run_sweep(with_settings(named_sweep(sweep), _settings(execution, settings)), out)
+    with results_at(out) as folder:
+        problems = run_sweep(with_settings(named_sweep(sweep), _settings(execution, settings)), folder)
     _fail_with(problems)
 
 
@@ -72,7 +75,8 @@ def reprocess(
     dry_run: Annotated[bool, Field(title="Only say what is stale, why, and what it costs")] = False,
 ) -> None:
     """Redo what is stale after a change of photos, cameras, splits, settings, code or model, and nothing else."""
-    problems = reprocess_command(out, split, from_stage, where or [], _settings(execution, settings), dry_run)
+    with results_at(out, writes=not dry_run) as folder:
+        problems = reprocess_command(folder, split, from_stage, where or [], _settings(execution, settings), dry_run)
     _fail_with(problems)
 
 

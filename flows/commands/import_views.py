@@ -8,7 +8,7 @@ from pathlib import Path
 from flows.errors import InputError
 from flows.exports.plan import open_plan
 from flows.generation.imported import Imported, digest, find_views, imported_into, read_view
-from flows.pipeline.locks import writing
+from flows.locks import writing
 from flows.progress import console, meter
 from schemas.scene_store import Run, SceneStore
 

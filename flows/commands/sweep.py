@@ -15,16 +15,16 @@ from schemas.settings import merged, settings_document
 SHIPPED = Path(__file__).parents[1] / "sweeps"
 
 
-def sweep_command(
-    config: str, out: Path, list_shipped: bool, config_file: Path | None = None, settings: Sequence[str] = ()
-) -> int:
-    """Exit code: 0 when every run is complete, 1 when some failed (each with a sentence on stderr). config_file,
+def list_sweeps() -> None:
+    """Print the shipped sweeps."""
+    for path in sorted(SHIPPED.glob("*.yaml")):
+        sweep = load_config(path, SweepConfig)
+        console.print(f"[bold]{path.stem}[/bold]  {len(sweep.scenes)} scenes. {sweep.note}")
+
+
+def sweep_command(config: str, out: Path, config_file: Path | None = None, settings: Sequence[str] = ()) -> list[str]:
+    """Do what is missing of a sweep. Returns a sentence for each run that failed, said on stderr too. config_file,
     settings: further settings of all runs, over those of the sweep's `base`."""
-    if list_shipped or not config:
-        for path in sorted(SHIPPED.glob("*.yaml")):
-            sweep = load_config(path, SweepConfig)
-            console.print(f"[bold]{path.stem}[/bold]  {len(sweep.scenes)} scenes. {sweep.note}")
-        return 0
     from flows.pipeline.sweep import run_sweep
 
     given = load_config(config_file).model_dump(mode="json", exclude_unset=True) if config_file else {}
@@ -32,7 +32,7 @@ def sweep_command(
     problems = run_sweep(sweep, out)
     for sentence in problems:
         print(f"cat3d: {sentence}", file=sys.stderr)
-    return 1 if problems else 0
+    return problems
 
 
 def named_sweep(name: str) -> SweepConfig:

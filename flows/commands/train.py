@@ -13,7 +13,7 @@ from rich.table import Table
 
 from cat3d_core.diffusion import count_parameters
 from flows.errors import InputError
-from flows.pipeline.locks import writing
+from flows.locks import writing
 from flows.pipeline.versions import provenance
 from flows.progress import console
 from flows.training.loop import MODEL, SHEETS, STATE, TABLES, train

@@ -13,8 +13,8 @@ import numpy as np
 
 from flows.jobs.job import Job
 from flows.jobs.usage import Usage, measured
+from flows.locks import writing
 from flows.pipeline.keys import Step, pending, stage, upstream
-from flows.pipeline.locks import writing
 from flows.pipeline.versions import provenance
 from flows.progress import console
 from schemas.documents import sync_tree

@@ -5,7 +5,7 @@ Tasks get the job (paths and settings) and the step (the wanted content key); re
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from prefect import flow, task
@@ -13,6 +13,7 @@ from prefect.cache_policies import NO_CACHE
 from rich.markup import escape
 
 from flows.jobs.job import Job
+from flows.object_storage import copy_out
 from flows.pipeline.keys import Step, stage
 from flows.pipeline.prefect_records import Advance, claim, is_deployed, publish
 from flows.pipeline.runner import execute_stage
@@ -64,12 +65,18 @@ def scene_flow(scene_id: str, jobs: Sequence[Job]) -> list[StageRecord]:
     return list({id(record): record for record in records}.values())  # one that two runs waited for is in both
 
 
-def run_jobs(jobs: Sequence[Job], **options: Any) -> list[Result]:
+def run_jobs(jobs: Sequence[Job], finished: Callable[[Result], None] | None = None, **options: Any) -> list[Result]:
     """`do_jobs` with each missing stage a task of the flow that calls this; a deployment's shows how far it is and what
-    came of it."""
+    came of it. Results on object storage are copied there as runs end."""
     claim()
+
+    def over(result: Result) -> None:
+        if finished is not None:
+            finished(result)
+        copy_out(result.job.out)
+
     if not jobs or not is_deployed():
-        return do_jobs(jobs, perform, **options)
-    results = do_jobs(jobs, perform, advanced=Advance(jobs[0].out), **options)
+        return do_jobs(jobs, perform, over, **options)
+    results = do_jobs(jobs, perform, over, advanced=Advance(jobs[0].out), **options)
     publish(jobs[0].out)
     return results

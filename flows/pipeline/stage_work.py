@@ -10,8 +10,8 @@ from typing import Any
 from flows.generation.open import forget_generator
 from flows.jobs.device import device
 from flows.jobs.job import Job
+from flows.locks import only_worker
 from flows.pipeline.keys import Step, stage
-from flows.pipeline.locks import only_worker
 from flows.pipeline.runner import execute_stage
 from flows.workers.pulse import Pulse, read_pulse
 from flows.workers.work import Sign, Work

@@ -162,7 +162,7 @@ def servers_of(out: Path) -> list[str]:
 
 def test_only_one_command_writes_a_store(tmp_path: Path) -> None:
     from flows.errors import InputError
-    from flows.pipeline.locks import writing
+    from flows.locks import writing
 
     busy = pytest.raises(InputError, match=f"process {os.getpid()}.*is writing")
     with writing(tmp_path / "s.zarr", "s"), busy, writing(tmp_path / "s.zarr", "s"):

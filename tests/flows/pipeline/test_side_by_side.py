@@ -15,9 +15,9 @@ import pytest
 from flows.errors import WorkerError
 from flows.jobs.job import Job
 from flows.jobs.metric_table import metric_table
+from flows.locks import only_worker
 from flows.pipeline.costs import Costs, Outlook
 from flows.pipeline.keys import pending
-from flows.pipeline.locks import only_worker
 from flows.pipeline.scene import scene_flow
 from flows.pipeline.side_by_side import shared_keys
 from flows.pipeline.sweep import run_sweep, sweep_jobs
