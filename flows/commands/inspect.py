@@ -92,5 +92,5 @@ def expected_keys(path: Path) -> tuple[dict[tuple[str | None, str], set[str]] | 
         except InputError as error:
             return None, f"Whether stages are stale is unknown, since the source can't be read: {error}"
         for stage, step in steps.items():
-            expected.setdefault((None if stage in SCENE_STAGES else name, stage), set()).add(step.key)
+            expected.setdefault((None if stage in SCENE_STAGES else name, stage), set()).update((step.key, step.older))
     return expected, ""

@@ -30,6 +30,10 @@ def _nothing(_config: RunConfig) -> dict[str, Any]:
     return {}
 
 
+def _never(_job: Job) -> bool:
+    return False
+
+
 def _no_inputs(_job: Job, _keys: Mapping[str, str]) -> dict[str, Any]:
     return {}
 
@@ -46,6 +50,7 @@ class Stage:
     inputs(job, keys): what else the result depends on, as plain JSON values. keys: the content keys of earlier stages;
     an entry "STAGE key" replaces the key of a stage that is read by what of it matters.
     wanted(job): whether the job has the stage at all.
+    seedless(job): whether its result is the same for every seed, so that runs of all seeds share one.
     passing: its result serves the next stage alone, and may be another run's by then: not redone while that stage is
     done.
     needs: what it asks of a worker. spreads: `execute` itself hands its items out to workers (`fan_out`), so that it is
@@ -59,6 +64,7 @@ class Stage:
     settings: Callable[[RunConfig], dict[str, Any]] = _nothing
     inputs: Callable[[Job, Mapping[str, str]], dict[str, Any]] = _no_inputs
     wanted: Callable[[Job], bool] = _always
+    seedless: Callable[[Job], bool] = _never
     passing: bool = False
     needs: Needs = Needs()
     spreads: bool = False

@@ -20,7 +20,8 @@ from schemas.scene_store import SceneStore
 
 @dataclass(frozen=True)
 class Step:
-    """One stage of one job with everything its content key is made of."""
+    """One stage of one job with everything its content key is made of. older: the key of an equal result that was made
+    when the seed was part of every key."""
 
     stage: str
     key: str
@@ -28,6 +29,7 @@ class Step:
     config: dict[str, Any]
     version: str
     why: str = field(default="", compare=False)
+    older: str = field(default="", compare=False)
 
 
 def stage(name: str) -> Stage:
@@ -66,11 +68,21 @@ def expected_steps(job: Job) -> dict[str, Step]:
     steps: dict[str, Step] = {}
     for one in stages_of(job):
         keys = {name: step.key for name, step in steps.items()}
-        inputs = {f"{name} key": keys[name] for name in one.reads if name in keys} | one.inputs(job, keys)
-        config, version = one.settings(job.config), str(one.version)
+        older = {name: step.older for name, step in steps.items()}
+        inputs, config, version = _inputs(one, job, keys), one.settings(job.config), str(one.version)
+        older_key = ""
+        if older != keys or one.seedless(job):
+            before = _inputs(one, job, older) if older != keys else inputs
+            older_key = content_key(stage=one.name, inputs=before, config=config, version=version)
+        if one.seedless(job):
+            config = config | {"seed": 0}
         key = content_key(stage=one.name, inputs=inputs, config=config, version=version)
-        steps[one.name] = Step(one.name, key, inputs, config, version)
+        steps[one.name] = Step(one.name, key, inputs, config, version, older=older_key or key)
     return steps
+
+
+def _inputs(one: Stage, job: Job, keys: dict[str, str]) -> dict[str, Any]:
+    return {f"{name} key": keys[name] for name in one.reads if name in keys} | one.inputs(job, keys)
 
 
 def pending(job: Job, steps: dict[str, Step] | None = None) -> list[Step]:
@@ -97,7 +109,7 @@ def stale_reason(store: SceneStore, run: str, step: Step) -> str:
     record = store.record(step.stage, run)
     if record is None:
         return "not done yet"
-    if record.key == step.key:
+    if record.key in (step.key, step.older):
         return ""
     changes = []
     if record.code_version != step.version:

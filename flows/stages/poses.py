@@ -28,6 +28,11 @@ def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
     return {"cameras": job.scene.digests["cameras"]}
 
 
+def are_given(job: Job) -> bool:
+    """Whether nothing is estimated, so that no randomness comes in."""
+    return job.config.poses.estimate != "always" and job.scene.digests["cameras"]["poses"] is not None
+
+
 def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     """Write `world_from_camera` (scene frame), `registered`, points and depth bounds, and the similarity."""
     capture = job.capture()
@@ -139,4 +144,7 @@ def write_poses(
     )
 
 
-STAGE = Stage("poses", execute, version=1, reads=("ingest",), settings=settings_of("poses", "seed"), inputs=inputs)
+STAGE = Stage(
+    "poses", execute, version=1, reads=("ingest",), settings=settings_of("poses", "seed"), inputs=inputs,
+    seedless=are_given,
+)  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import threading
@@ -21,6 +22,7 @@ from flows.pipeline.keys import pending
 from flows.pipeline.scene import scene_flow
 from flows.pipeline.side_by_side import shared_keys
 from flows.pipeline.sweep import run_sweep, sweep_jobs
+from flows.stages import STAGES
 from flows.workers.pulse import Pulse, read_pulse
 from schemas.scene_store import SceneStore
 from schemas.tables import TIMINGS, read_rows
@@ -131,6 +133,24 @@ def test_runs_that_want_other_photos_of_a_scene_come_after_one_another(tmp_path:
         (20, 24),
         (40, 48),
     ]
+
+
+def test_runs_of_all_seeds_share_given_cameras_and_are_done_then(
+    tmp_path: Path, prefect_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = sweep_of(SOURCE, seeds=[0, 1], base={"execution": {"workers": 1}})
+    with monkeypatch.context() as patch:  # as before, when the cameras' key had the seed in it
+        before = (dataclasses.replace(s, seedless=lambda _: False) for s in STAGES)
+        patch.setattr("flows.pipeline.keys.STAGES", tuple(before))
+        assert run_sweep(config, tmp_path) == []
+    [jobs], _ = sweep_jobs(config, tmp_path)
+    assert shared_keys(jobs[0]) == shared_keys(jobs[1])
+    assert [step.stage for job in jobs for step in pending(job) if step.stage != "poses"] == [], "older results stay"
+    assert run_sweep(config, tmp_path) == []
+    executed = stages_of_timings(tmp_path)
+    assert run_sweep(config, tmp_path) == []
+    assert stages_of_timings(tmp_path) == executed
+    assert [pending(job) for job in jobs] == [[], []]
 
 
 def test_the_longest_run_comes_first_and_the_time_left_is_that_of_the_longest_or_of_all(tmp_path: Path) -> None:
