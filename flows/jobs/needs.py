@@ -14,3 +14,6 @@ class Needs(BaseModel):
 
     gpu: bool = False
     memory_gb: float = 0.5
+
+    def __str__(self) -> str:
+        return f"{self.memory_gb:g} GB of memory" + (" and the resources of the settings" if self.gpu else "")

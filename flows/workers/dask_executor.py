@@ -85,7 +85,7 @@ class DaskExecutor:
                 address
                 for address, worker in self.known.items()
                 if all(worker["resources"].get(name, 0) >= value for name, value in resources.items())
-                and not 0 < worker["memory_limit"] < needs.memory_gb * 1e9
+                and not 0 < worker["memory_limit"] < 0.95 * needs.memory_gb * 1e9  # 2 GB of a batch system are 1.99
             )
         return self.able[needs]
 

@@ -117,7 +117,8 @@ class Sharing:
             self._consider(order)
         if full and not self.out and self.clock() > self.next_say:
             self.next_say = self.clock() + SAY_S
-            console.print("Waiting for workers: the cluster has none yet that these stages can run on.")
+            asked = ", ".join(sorted({str(needs) for needs in full}))
+            console.print(f"Waiting for workers: the cluster has none yet with what is to be done next ({asked}).")
 
     def _hand_out_of(self, order: Order) -> bool:
         """Hand out what is ready of an order; False where there was no room for all of it."""

@@ -36,7 +36,7 @@ def slurm(out: Path, walltime: str = "00:10:00") -> dict[str, Any]:
     return {
         "executor": "dask", "workers": 2, "dask_cluster": "dask_jobqueue.SLURMCluster",
         "dask_options": {
-            "queue": partition(), "cores": 1, "processes": 1, "memory": "2GB", "walltime": walltime,
+            "queue": partition(), "cores": 1, "processes": 1, "memory": "3GB", "walltime": walltime,
             "python": sys.executable, "log_directory": str(out / "slurm"), "interface": "lo",
             "scheduler_options": {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"},
         },
@@ -50,6 +50,7 @@ def importable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_a_sweep_on_slurm_whose_jobs_are_cancelled_gives_the_table_of_one_process(
     tmp_path: Path, prefect_url: str, importable: None
 ) -> None:
