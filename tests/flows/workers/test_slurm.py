@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from flows.pipeline.sweep import run_sweep
+from schemas.scene_store import SceneStore
 from tests.flows.conftest import ROOT
 from tests.flows.pipeline.test_side_by_side import SOURCE, metrics_of, stages_of_timings, swept
 from tests.flows.pipeline.test_sweep import TRAINER, sweep_of
@@ -70,3 +71,21 @@ def test_a_sweep_on_slurm_whose_jobs_are_cancelled_gives_the_table_of_one_proces
     assert cancelled
     assert metrics_of(out) == swept(tmp_path / "here", SOURCE, methods=methods, workers=1)
     assert stages_of_timings(out) == stages_of_timings(tmp_path / "here"), "nothing was done twice"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1500)
+def test_jobs_that_end_by_their_time_limit_are_replaced_and_the_training_goes_on(
+    tmp_path: Path, prefect_url: str, importable: None
+) -> None:
+    """A reconstruction that takes longer than a job may: a job is ended after one to two minutes."""
+    long = {"reconstruct": {"overrides": TRAINER | {"iterations": 15000}}, "skip": {"plateau": False}}
+    settings = slurm(tmp_path, walltime="00:01:00") | {"workers": 1}
+    out = tmp_path / "slurm"
+    assert run_sweep(sweep_of(SOURCE, methods={"a": long}, base={"execution": settings}), out) == []
+    ended = [path for path in (tmp_path / "slurm").glob("*.err") if "DUE TO TIME LIMIT" in path.read_text()]
+    assert ended
+    record = SceneStore.open(out / "procedural_llff_2.zarr").record("reconstruct", "v3-a")
+    assert record is not None
+    assert any(d.text.startswith("Went on from the checkpoint at iteration") for d in record.decisions)
+    assert metrics_of(out) == swept(tmp_path / "here", SOURCE, methods={"a": long}, workers=1)
