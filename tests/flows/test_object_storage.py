@@ -222,3 +222,54 @@ def test_a_folder_where_nothing_is_and_a_damaged_state_are_sentences(bucket: Any
 def test_plain_folders_are_themselves(tmp_path: Path) -> None:
     with results_at(tmp_path) as folder:
         assert folder == tmp_path
+
+
+def test_every_call_to_the_storage_fails_once_in_turn(
+    bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sentence each time; the next command finishes, and another machine finds what an undisturbed one leaves."""
+    before = {"a.zarr/stages/x": "1", "a.zarr/c/0": "1", "b.zarr/c/0": "1"}
+    after = {"a.zarr/stages/x": "2", "a.zarr/c/0": "22", "b.zarr/c/1": "2"}
+    calls = {name: getattr(obstore, name) for name in ("get", "put", "list", "delete")}
+    count, fails_at = 0, -1
+
+    def counted(name: str) -> Any:
+        def call(*arguments: Any, **options: Any) -> Any:
+            nonlocal count
+            count += 1
+            if count == fails_at:
+                raise obstore.exceptions.GenericError("Generic S3 error: connection reset")
+            return calls[name](*arguments, **options)
+
+        return call
+
+    for name in calls:
+        monkeypatch.setattr(obstore, name, counted(name))
+    monkeypatch.setattr(claim.psutil, "pid_exists", lambda pid: False)  # each command was a process of its own
+    monkeypatch.setattr(mirror, "THREADS", 1)
+
+    def command(address: Path) -> None:
+        with results_at(address) as folder:
+            write(folder, after)
+            (folder / "b.zarr/c/0").unlink(missing_ok=True)
+
+    number, told = 0, list[str]()
+    while len(told) == number:
+        number += 1
+        address = Path(f"s3://results/team/{number}")
+        fails_at = -1
+        with results_at(address) as folder:
+            write(folder, before)
+        count, fails_at = 0, number
+        try:
+            command(address)
+        except WorkerError as error:
+            told.append(str(error))
+        fails_at = -1
+        command(address)
+        other_machine(monkeypatch, tmp_path, f"elsewhere{number}")
+        with results_at(address, writes=False) as folder:
+            assert texts(folder) == after, f"call {number}"
+        monkeypatch.setenv("CAT3D_WORK", str(tmp_path / "work"))
+    assert len(told) >= 9, "calls of a command that changes three files and removes one"
+    assert all("cannot be used: Generic S3 error: connection reset" in sentence for sentence in told)
