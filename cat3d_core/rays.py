@@ -103,3 +103,18 @@ def _inverse_intrinsics(k: Tensor) -> Tensor:
     inverse[:, 0, 2] = (skew * cy / fy - cx) / fx
     inverse[:, 1, 2] = -cy / fy
     return inverse
+
+
+def perpendicular_basis(directions: Tensor) -> Tensor:
+    """Two unit vectors (..., 2, 3) orthogonal to `directions` (..., 3) (any non-zero length) and to each other.
+
+    Branch-free and deterministic, well conditioned for every direction (Duff et al., "Building an Orthonormal Basis,
+    Revisited", JCGT 2017).
+    """
+    x, y, z = (directions / directions.norm(dim=-1, keepdim=True)).unbind(-1)
+    sign = torch.where(z < 0, -1.0, 1.0).to(z.dtype)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first = torch.stack([1.0 + sign * x.square() * a, sign * b, -sign * x], -1)
+    second = torch.stack([b, sign + y.square() * a, -y], -1)
+    return torch.stack([first, second], -2)

@@ -62,6 +62,11 @@ def covering_radius(cameras: Cameras, chosen: list[int], scale: float = 1.0) -> 
     return float(pose_distance(cameras, cameras[chosen], scale, 0.0).amin(1).max())
 
 
+def evenly(count: int, most: int) -> list[int]:
+    """Positions of at most `most` of `count` things, in order, evenly spread from the first to the last."""
+    return [round(i * (count - 1) / max(1, min(most, count) - 1)) for i in range(min(most, count))]
+
+
 def consecutive_groups(views: list[int], size: int) -> list[list[int]]:
     """Runs of `size` of the given views in order; the last run may be shorter.
 

@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.quaternions import quaternions_from_rotations
-from cat3d_core.rays import image_rays
+from cat3d_core.rays import image_rays, perpendicular_basis
 from cat3d_core.reconstruction.render import Render
 from cat3d_core.splats.gaussians import Gaussians, harmonics_of_colour
 
@@ -100,11 +100,5 @@ def _cells(means: Tensor, widths: Tensor, cell: float) -> tuple[Tensor, int]:
 
 
 def _frames(normal: Tensor) -> Tensor:
-    """(N, 3, 3) rotations whose last columns are unit normals (N, 3) (Duff et al. 2017)."""
-    x, y, z = normal.unbind(-1)
-    sign = torch.where(z >= 0, 1.0, -1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    first = torch.stack([1.0 + sign * x * x * a, sign * b, -sign * x], -1)
-    second = torch.stack([b, sign + y * y * a, -y], -1)
-    return torch.stack([first, second, normal], -1)
+    """(N, 3, 3) rotations whose last columns are unit normals (N, 3)."""
+    return torch.cat([perpendicular_basis(normal), normal[..., None, :]], -2).mT

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cat3d_core.rays import Rays
+from cat3d_core.rays import Rays, perpendicular_basis
 from cat3d_core.stress.draw import Draw
 from cat3d_core.stress.routine import DOUBLE, ROUNDING, SINGLE, Exact, Routine, zero
 from cat3d_core.zipnerf import stepfun
@@ -13,7 +13,6 @@ from cat3d_core.zipnerf.frustums import (
     cone_samples,
     grid_samples,
     grid_samples_reference,
-    perpendicular_basis,
     sample_distances,
 )
 
@@ -220,7 +219,7 @@ ROUTINES = [
         _far_histogram, _quantile, zero, ROUNDING,
     ),
     Routine(
-        "frustums.perpendicular_basis", "orthonormal for every direction", _direction_inputs, _basis, zero,
+        "rays.perpendicular_basis", "orthonormal for every direction", _direction_inputs, _basis, zero,
         ROUNDING,
     ),
     Routine(

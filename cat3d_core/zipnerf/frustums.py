@@ -10,27 +10,12 @@ import torch
 from torch import Tensor
 
 from cat3d_core.cpu_library import library, pointer
-from cat3d_core.rays import Rays
+from cat3d_core.rays import Rays, perpendicular_basis
 from cat3d_core.zipnerf.coordinates import contract, contracted_std
 
 # Around the cone in an order that decorrelates angle from depth (Zip-NeRF's 'hexify'); three samples take every second
 # one.
 _TURNS = {6: (0, 2, 4, 3, 5, 1), 3: (0, 2, 4)}
-
-
-def perpendicular_basis(directions: Tensor) -> Tensor:
-    """Two unit vectors (..., 2, 3) orthogonal to `directions` (..., 3) (any non-zero length) and to each other.
-
-    Branch-free and deterministic, well conditioned for every direction (Duff et al., "Building an Orthonormal Basis,
-    Revisited", JCGT 2017).
-    """
-    x, y, z = (directions / directions.norm(dim=-1, keepdim=True)).unbind(-1)
-    sign = torch.where(z < 0, -1.0, 1.0).to(z.dtype)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    first = torch.stack([1.0 + sign * x.square() * a, sign * b, -sign * x], -1)
-    second = torch.stack([b, sign + y.square() * a, -y], -1)
-    return torch.stack([first, second], -2)
 
 
 def sample_distances(t: Tensor, count: int = 6) -> Tensor:

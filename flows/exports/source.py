@@ -12,6 +12,7 @@ import torch
 from cat3d_core.cameras import Cameras
 from cat3d_core.normalization import Similarity
 from cat3d_core.reconstruction import Reconstructor, Render
+from cat3d_core.view_selection import evenly
 from flows.errors import InputError
 from flows.generation.views import generated_views
 from flows.jobs.access import read_cameras, read_images, read_similarity, views_with_role
@@ -83,7 +84,7 @@ def surface_cameras(source: Source, limit: int) -> Cameras:
     if "path" in run.section("renders"):
         cameras.append(read_cameras(run.renders("path")))
     every = Cameras.cat(cameras)
-    return every[torch.linspace(0, len(every) - 1, min(limit, len(every))).round().long()]
+    return every[evenly(len(every), limit)]
 
 
 def render_views(source: Source, cameras: Cameras, scale: float = 1.0) -> Iterator[Render]:

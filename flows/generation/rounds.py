@@ -17,7 +17,7 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.rays import image_rays
 from cat3d_core.reconstruction import Reconstructor, Views
 from cat3d_core.uncertainty import unseen
-from cat3d_core.view_selection import pose_distance
+from cat3d_core.view_selection import evenly, pose_distance
 from flows.generation.brief import brief_reconstruction, brief_render
 from flows.generation.groups import StoredPlan
 from flows.generation.hints import explained_views
@@ -74,7 +74,7 @@ class Rounds(OneRound):
             return
         *anchors, rest = self.passes
         size = math.ceil(SHARE * len(rest))
-        chosen = [rest[i] for i in np.unique(np.linspace(0, len(rest) - 1, size).round().astype(int))]
+        chosen = [rest[i] for i in evenly(len(rest), size)]
         self.kept, before, number = [], self.held_out_psnr(self.brief([])), 0
         while chosen:
             yield [*anchors, chosen]

@@ -23,6 +23,7 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
+from cat3d_core.cpu_library import cache_folder
 from flows.disk import naming_full_disk
 from flows.errors import ServerError
 from schemas.documents import write_bytes
@@ -183,14 +184,13 @@ def _stop(process: subprocess.Popen) -> None:
 
 
 def _template_path() -> Path | None:
-    """Where the empty database is kept for the next server; None where there is no home, as in some containers."""
+    """Where the empty database is kept for the next server; None where nothing can be kept."""
     import importlib.metadata
 
     try:
-        cache = Path(os.environ.get("CAT3D_CACHE") or Path.home() / ".cache" / "cat3d")
-    except RuntimeError:
+        return cache_folder() / f"prefect-{importlib.metadata.version('prefect')}.db"
+    except OSError:
         return None
-    return cache / f"prefect-{importlib.metadata.version('prefect')}.db"
 
 
 def _save_template(database: Path, template: Path) -> None:

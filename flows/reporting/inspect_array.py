@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cat3d_core.view_selection import evenly
 from flows.errors import InputError
 from flows.media.images import write_png
 from flows.media.pictures import depth_picture, share_picture
@@ -77,7 +78,7 @@ def contact_sheet(store: SceneStore, path: str, target: Path) -> None:
     if kind not in ("image", "mask", "depth", "latent") or not shape[0]:
         pictures = [s for s, node in nodes(store.folder) if node == "array" and _is_picture(s)]
         raise InputError(f"{path} holds no pictures; those that do: {', '.join(pictures) or 'none yet'}.")
-    views = np.linspace(0, shape[0] - 1, min(shape[0], SHEET_VIEWS)).round().astype(int).tolist()
+    views = evenly(shape[0], SHEET_VIEWS)
     empty = np.zeros((CELL, CELL, 3), np.uint8)  # what was never written is black
     read = arrays.read_views(store.folder / name, views)
     if spec is not None and kind == "depth" and spec.unit != "scene unit":

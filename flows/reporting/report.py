@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, select_autoescape
 
+from cat3d_core.view_selection import evenly
 from flows.disk import naming_full_disk
 from flows.jobs.metric_table import metric_table
 from flows.media.pictures import depth_picture, error_picture
@@ -191,9 +192,8 @@ def view_pictures(
     section = run.renders("test")
     views = section.read("view")
     names = store.captured.read("name")
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(VIEWS_SHOWN, len(views))).round().astype(int))
     out = []
-    for i in chosen.tolist():
+    for i in evenly(len(views), VIEWS_SHOWN):
         view = int(views[i])
         truth = truths.setdefault(view, store.captured.read_image("image", view))
         image = section.read_image("image", i)

@@ -15,6 +15,7 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.rays import image_rays
 from cat3d_core.reconstruction import Render, normals_from_depth
 from cat3d_core.splats import Gaussians
+from cat3d_core.view_selection import evenly
 from flows.errors import InputError
 from flows.exports.preview import kept_preview
 from flows.exports.splat_files import write_splat
@@ -56,7 +57,7 @@ def turning_scene(store: SceneStore, run: Run, room: int) -> dict[str, Any] | No
         write_splat(file, splats)
         encoded = base64.b64encode(file.read_bytes()).decode()
     points = scene_points(store)
-    points = points[np.unique(np.linspace(0, len(points) - 1, min(POINTS, len(points))).round().astype(int))]
+    points = points[evenly(len(points), POINTS)]
     rows = camera_rows([*captured_views(store, run, pictures=False), *planned_views(run, pictures=False)])
     cameras = json.dumps({"cameras": rows, "points": np.round(points.astype(float), 3).tolist()})
     size = len(encoded) + len(cameras)
@@ -113,7 +114,7 @@ def camera_rows(views: list[ShownView]) -> list[dict[str, Any]]:
     rows = []
     for kind, colour in COLOURS.items():
         some = [view for view in views if view.kind == kind]
-        for at in np.unique(np.linspace(0, len(some) - 1, min(CAMERAS, len(some))).round().astype(int)).tolist():
+        for at in evenly(len(some), CAMERAS):
             camera = some[at].camera
             k, (width, height) = camera.intrinsics[0].double(), camera.size[0].tolist()
             across = [(edge - float(k[0, 2])) / float(k[0, 0]) for edge in (0, width)]

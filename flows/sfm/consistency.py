@@ -16,6 +16,7 @@ from itertools import combinations
 
 import numpy as np
 
+from cat3d_core.view_selection import evenly
 from flows.media.images import read_image
 from flows.readers.base import Capture
 from flows.sfm.colmap import pycolmap
@@ -110,7 +111,7 @@ def measure_consistency(capture: Capture) -> Consistency:
 def evidence(capture: Capture) -> Evidence:
     """Features and agreeing matches of up to MOST_VIEWS views, evenly spaced ones of a larger scene."""
     pycolmap.logging.minloglevel = 3
-    views = np.unique(np.linspace(0, len(capture) - 1, min(len(capture), MOST_VIEWS)).round().astype(int)).tolist()
+    views = evenly(len(capture), MOST_VIEWS)
     found = {v: features(capture, v, _pixels(capture, v)) for v in views}
     agreed = {}
     for a, b in _candidates(found):

@@ -34,7 +34,7 @@ from cat3d_core.sample_sets import sample_cameras, source_boxes
 from cat3d_core.synthetic import FAMILIES
 from cat3d_core.synthetic.held_out import held_out_group
 from cat3d_core.synthetic.tracer import Traced
-from cat3d_core.view_selection import camera_distance
+from cat3d_core.view_selection import camera_distance, evenly
 from cat3d_core.warp import warp
 from flows.errors import InputError
 from flows.generation.formats import cat3d
@@ -60,8 +60,7 @@ def captured_group(scene: Path, size: int, given: int, views: int = 8) -> tuple[
         raise InputError(f"{scene} has no cameras; samples are compared with photographs from known ones.")
     split = capture.splits[str(given)]
     test = split["test"]
-    rows = torch.linspace(0, len(test) - 1, min(views - given, len(test))).round().long().tolist()
-    chosen = [*split["train"], *(test[row] for row in rows)]
+    chosen = [*split["train"], *(test[row] for row in evenly(len(test), views - given))]
     cameras = normalize_scene(capture.cameras, capture.points, capture.depth_bounds).cameras(capture.cameras)[chosen]
     boxes = source_boxes(cameras.size, "square").tolist()
     squares = [

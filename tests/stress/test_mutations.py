@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import typer
 
-from cat3d_core import alignment, cameras, splines
+from cat3d_core import alignment, cameras, rays, splines
 from cat3d_core.diffusion import guidance, schedule, solvers
 from cat3d_core.metrics import psnr, ssim
 from cat3d_core.reconstruction import render as image_render
@@ -123,9 +123,9 @@ MUTATIONS: dict[str, tuple[Callable[..., Any], dict[str, str], str]] = {
         "frustums.sample_distances",
     ),
     "sign of zero": (
-        frustums.perpendicular_basis,
+        rays.perpendicular_basis,
         {"torch.where(z < 0, -1.0, 1.0).to(z.dtype)": "z.sign()"},
-        "frustums.perpendicular_basis",
+        "rays.perpendicular_basis",
     ),
     "density without cap": (
         gradients._SafeExp.forward,

@@ -6,13 +6,12 @@ import pytest
 import torch
 
 from cat3d_core.cpu_library import library
-from cat3d_core.rays import Rays
+from cat3d_core.rays import Rays, perpendicular_basis
 from cat3d_core.zipnerf import frustums
 from cat3d_core.zipnerf.frustums import (
     cone_samples,
     grid_samples,
     grid_samples_reference,
-    perpendicular_basis,
     sample_distances,
 )
 
