@@ -47,7 +47,9 @@ class MixtureNetwork(nn.Module):
         means = torch.randn(modes, size, generator=generator(0, "mixture"), dtype=torch.float64)
         self.means = nn.Parameter(means * (1 - std**2) ** 0.5, requires_grad=False)
 
-    def forward(self, latents: Tensor, time: Tensor, cameras: Tensor, mask: Tensor) -> Tensor:
+    def forward(
+        self, latents: Tensor, time: Tensor, cameras: Tensor, mask: Tensor, hints: Tensor | None = None
+    ) -> Tensor:
         dtype = self.means.dtype
         x = latents[:, -self.targets :].flatten(1).double()
         alpha, sigma = (float(s) for s in alpha_sigma(self._log_snr(float(time[0]))))

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from flows.bench import store
+from flows.bench import sampler, store
 from flows.bench.fronts import cell, drawn_panels, pareto_front, verdict
 from flows.bench.page import read_benches, tables, worth_showing, write_page
 from flows.bench.registry import BENCHES, Bench, Panel
@@ -167,3 +167,10 @@ def test_long_tables_show_fronts_and_defaults():
     assert worth_showing(rows, []) == rows
     shown = worth_showing(rows, drawn_panels(PANEL, rows))
     assert {row["name"] for row in shown} == {"a", "b", "c", "worse than b"}
+
+
+def test_the_samplers_bench_measures_errors_that_fall_with_steps() -> None:
+    rows = sampler.rows(steps=(4, 8), groups=2)
+    chosen = [r for r in rows if (r["solver"], r["dtype"], r["interval"]) == ("unipc", "float32", "all")]
+    errors = {(r["nodes"], r["steps"]): r["error"] for r in chosen}
+    assert errors["log_snr", 8] < errors["log_snr", 4] < 0.5
