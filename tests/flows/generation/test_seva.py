@@ -83,6 +83,7 @@ def test_captured_views_are_in_every_window_and_anchors_come_first(whole: tuple[
     assert all(image.std() > 1 for image in images)
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_by_two_workers_it_gives_equal_bits(
     whole: tuple[Path, str], model: Path, prefect_url: str, tmp_path: Path
 ) -> None:

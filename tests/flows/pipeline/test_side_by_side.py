@@ -119,6 +119,7 @@ def jobs_of(out: Path, source: str = SOURCE, **changes: Any) -> list[Job]:
     return sweep_jobs(sweep_of(source, **changes), out)[0][0]
 
 
+@pytest.mark.slow
 def test_runs_that_want_other_photos_of_a_scene_come_after_one_another(tmp_path: Path, prefect_url: str) -> None:
     methods = {"whole": {}, "half": {"ingest": {"downscale": 2}}, "again": {}}
     source = "procedural:llff/2?views=9&width=48&height=40"
