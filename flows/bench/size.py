@@ -28,7 +28,7 @@ from flows.media.images import write_jpeg
 from schemas.tables import TIMINGS, read_rows
 
 #: Photos have the shape 4 : 3; sides by millions of pixels.
-SIZES = {1: (1160, 870), 4: (2320, 1740), 12: (4000, 3000)}
+SIZES = {1: (1152, 864), 4: (2320, 1740), 12: (4000, 3000)}
 #: The wall is drawn at this share of the size and repeated, with grain on top as sensors have it.
 COARSE = 4
 FOCAL = 0.8

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from flows.bench import sampler, store
+from flows.bench import sampler, size, store
 from flows.bench.fronts import cell, drawn_panels, pareto_front, verdict
 from flows.bench.page import read_benches, tables, worth_showing, write_page
 from flows.bench.registry import BENCHES, Bench, Panel
@@ -174,3 +174,9 @@ def test_the_samplers_bench_measures_errors_that_fall_with_steps() -> None:
     chosen = [r for r in rows if (r["solver"], r["dtype"], r["interval"]) == ("unipc", "float32", "all")]
     errors = {(r["nodes"], r["steps"]): r["error"] for r in chosen}
     assert errors["log_snr", 8] < errors["log_snr", 4] < 0.5
+
+
+def test_sizes_of_the_bench_of_sizes_can_be_drawn() -> None:
+    for megapixels, (width, height) in size.SIZES.items():
+        assert width % size.COARSE == height % size.COARSE == 0
+        assert width * height == pytest.approx(megapixels * 1e6, rel=0.02)
