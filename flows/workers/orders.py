@@ -52,7 +52,8 @@ class Order:
         self.works, self.settings, self.progress, self.clock = works, settings, progress, clock
         self.passes = [deque(deque(items) for items in work.passes if items) for work in works]
         self.out: Counter[int] = Counter()  # batches that workers have, by number of the work
-        self.deaths: Counter[tuple[int, int]] = Counter()
+        self.deaths: Counter[tuple[int, int]] = Counter()  # workers lost at an item since it last got further
+        self.furthest: dict[tuple[int, int], int] = {}
         self.totals = Totals()
         self.error: Exception | None = None
         self.over = threading.Event()

@@ -209,6 +209,9 @@ class Sharing:
         if not undone or order.error:
             return
         culprit = out.w, undone[0]
+        if out.sign is not None and out.sign.done > order.furthest.get(culprit, 0):
+            order.furthest[culprit] = out.sign.done
+            order.deaths[culprit] = 0  # long work on jobs of limited time is lost often, and goes on each time
         order.deaths[culprit] += 1
         if order.deaths[culprit] >= order.settings.attempts:
             order.fail(WorkerError(

@@ -79,7 +79,7 @@ def test_jobs_that_end_by_their_time_limit_are_replaced_and_the_training_goes_on
     tmp_path: Path, prefect_url: str, importable: None
 ) -> None:
     """A reconstruction that takes longer than a job may: a job is ended after one to two minutes."""
-    long = {"reconstruct": {"overrides": TRAINER | {"iterations": 15000}}, "skip": {"plateau": False}}
+    long = {"reconstruct": {"overrides": TRAINER | {"iterations": 10000}}, "skip": {"plateau": False}}
     settings = slurm(tmp_path, walltime="00:01:00") | {"workers": 1}
     out = tmp_path / "slurm"
     assert run_sweep(sweep_of(SOURCE, methods={"a": long}, base={"execution": settings}), out) == []
