@@ -52,6 +52,8 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     keys = view_keys(key, count)
     todo = set(np.flatnonzero(~section.done("done", keys, ("colour", *MAPS))).tolist()) if plan.needed else set()
     made = len(todo)
+    if not plan.needed:
+        section.mark_skipped("done", range(count))
     with meter(f"match {job.scene_id} {job.run}", made) as progress, cpu_threads(job.config.execution.threads):
         for kind in KINDS:
             views = sorted(todo.intersection(v for g in plan.groups if g.kind == kind for v in g.targets))
@@ -66,9 +68,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     explained = np.zeros(count, bool)
     if plan.needed and job.config.skip.explained:
         network = open_sweep(job)
-        for (
-            group
-        ) in plan.groups:  # a group is sampled whole or not at all, and anchors always: others need their latents
+        for group in plan.groups:  # sampled whole or not at all, and anchors always: others need their latents
             shown = not group.anchors and all(shows(network, read_hint(run, v).confidence) for v in group.targets)
             explained[list(group.targets)] = shown
     section.write("explained", explained)

@@ -25,6 +25,7 @@ from flows.stages import match as match_stage
 from flows.stages.sample import group_cost, group_sampler
 from flows.stages.training_views import training_views
 from schemas.scene_store import SceneStore
+from schemas.verify import verify
 from tests.flows.workers.scene import random_model, run_of, run_stages
 
 SOURCE, VIEWS = "procedural:dtu/3?views=9&width=32&height=24", 10
@@ -158,3 +159,18 @@ def test_an_interrupted_match_makes_what_is_missing(tmp_path: Path, model: Path,
     monkeypatch.setattr(match_stage, "_store", store)
     assert run_stages(one, "match")["match"].work["views"] == VIEWS - 4
     assert np.array_equal(run_of(one).section("hints").read("colour", [0]), before)
+
+
+@pytest.mark.parametrize("covered", [False, True])
+def test_what_is_not_looked_for_is_no_damage(
+    tmp_path: Path, model: Path, covered: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`cat3d inspect --verify` of a run whose path the photos cover, so that nothing is matched or generated."""
+    sweep = sweep_file(tmp_path / "sweep.safetensors", Composite(0.0, 0.1))
+    if covered:
+        monkeypatch.setattr("flows.stages.plan.COVERED_SHARE", 0.0)
+    settings = ("hints.use=always", f"hints.checkpoint={sweep}", f"skip.covered_path={str(covered).lower()}")
+    one = job(tmp_path / "out", model, *settings)
+    records = run_stages(one, *UP_TO_DECODE)
+    assert records["match"].work["views"] == (0 if covered else VIEWS)
+    assert list(verify(SceneStore.open(one.store_path))) == []
