@@ -31,22 +31,6 @@ PATIENCE = 240.0
 """Seconds: with software WebGL on a busy machine a frame may take some."""
 
 
-_WATCH = """(() => {
-  const copy = Object.assign(document.createElement('canvas'), {width: 48, height: 32});
-  const paper = copy.getContext('2d', {willReadFrequently: true});
-  const area = canvas => canvas.width * canvas.height;
-  const drawn = [...document.querySelectorAll('canvas')].sort((a, b) => area(b) - area(a))[0];
-  window.seen = {moves: [], frames: []};
-  addEventListener('pointermove', () => seen.moves.push(performance.now()), true);
-  const look = () => {
-    requestAnimationFrame(look);
-    paper.drawImage(drawn, 0, 0, 48, 32);
-    seen.frames.push([performance.now(), Array.from(paper.getImageData(0, 0, 48, 32).data)]);
-  };
-  requestAnimationFrame(look);
-})()"""
-
-
 def free_port() -> int:
     """A port of the loopback address that nothing listens on."""
     with socket.socket() as found:
@@ -111,11 +95,6 @@ class Tab:
     def resize(self, width: int, height: int) -> None:
         """Give the page this many pixels."""
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
-
-    def watch(self) -> None:
-        """Keep, from now on, the times of pointer moves (`seen.moves`) and of every frame a small copy of the largest
-        canvas (`seen.frames`: milliseconds, RGBA bytes), read right after the page has drawn it."""
-        self.run(_WATCH)
 
 
 class Browser:
