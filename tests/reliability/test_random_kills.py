@@ -70,6 +70,8 @@ class Cluster:
         }
         for name, arguments in wanted.items():
             if name not in self.processes or self.processes[name].poll() is not None:
+                if name == "scheduler":
+                    self.close()  # workers do not find to a new scheduler by themselves: who runs them starts new ones
                 self.processes[name] = subprocess.Popen(
                     [sys.executable, "-m", "distributed.cli.dask_" + arguments[0], *arguments[1:]], cwd=ROOT,
                     env=environment() | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.DEVNULL,
@@ -81,6 +83,7 @@ class Cluster:
             for child in [*psutil.Process(process.pid).children(recursive=True)] if process.poll() is None else []:
                 child.kill()
             process.kill()
+            process.wait()
 
 
 def victims(command: psutil.Process, cluster: Cluster | None) -> dict[str, psutil.Process]:
