@@ -51,6 +51,16 @@ class Raster(NamedTuple):
     median: Tensor
 
 
+class Composite(NamedTuple):
+    """The images; alpha before it is cut and the light left behind each Gaussian (pixels, N), nearest first; the
+    Gaussians' depths (N,)."""
+
+    raster: Raster
+    alpha: Tensor
+    light: Tensor
+    depth: Tensor
+
+
 class Projected(NamedTuple):
     """centre (N, 2) in pixels; conic (N, 3): a, b, c of 1/2 (a dx^2 + c dy^2) + b dx dy; opacity (N,); depth
     (N,)."""
@@ -108,10 +118,10 @@ def rasterize(
     antialias: bool = True,
 ) -> Raster:
     """The images of N Gaussians with features (N, C), put over one another, nearest first, over nothing (0)."""
-    return _composited(means, quaternions, scales, opacities, features, camera, window, antialias)[0]
+    return composite(means, quaternions, scales, opacities, features, camera, window, antialias).raster
 
 
-def rasterize_with_margin(
+def composite(
     means: Tensor,
     quaternions: Tensor,
     scales: Tensor,
@@ -120,31 +130,8 @@ def rasterize_with_margin(
     camera: Cameras,
     window: Window | None = None,
     antialias: bool = True,
-) -> tuple[Raster, Tensor]:
-    """`rasterize`, and (H, W) the relative distance of each pixel to its nearest cut (LEAST_ALPHA, LEAST_LIGHT, half of
-    the light, equal depths), where rounding decides and the result jumps."""
-    raster, raw, light, depth = _composited(means, quaternions, scales, opacities, features, camera, window, antialias)
-    with torch.no_grad():
-        ones = raw.new_ones((len(raw), 1))
-        margins = [ones, (raw / LEAST_ALPHA - 1).abs()]
-        margins += [(light / cut - 1).abs() for cut in (LEAST_LIGHT, 0.5)]
-        gap = depth.diff().abs() / depth[1:] if len(depth) > 1 else depth.new_ones(1)
-        margin = torch.cat(margins, 1).amin(1).minimum(gap.amin())
-    return raster, margin.view(raster.opacity.shape)
-
-
-def _composited(
-    means: Tensor,
-    quaternions: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    camera: Cameras,
-    window: Window | None,
-    antialias: bool,
-) -> tuple[Raster, Tensor, Tensor, Tensor]:
-    """The images; alphas before they are cut and the light left behind each Gaussian (pixels, N), nearest first; the
-    Gaussians' depths (N,)."""
+) -> Composite:
+    """`rasterize`, with what its cuts were made by."""
     x0, y0, width, height = window or whole(camera)
     flat = project(means, quaternions, scales, opacities, camera, antialias)
     shown = flat.depth.detach() > NEAR
@@ -169,4 +156,15 @@ def _composited(
         (weight @ features[order]).T.reshape(-1, *shape),
         (weight @ depth).view(shape), weight.sum(1).view(shape), median.view(shape),
     )  # fmt: skip
-    return raster, raw, light, depth
+    return Composite(raster, raw, light, depth)
+
+
+@torch.no_grad()
+def margin(found: Composite) -> Tensor:
+    """(H, W) the relative distance of each pixel to its nearest cut (LEAST_ALPHA, LEAST_LIGHT, half of the light, equal
+    depths), where rounding decides and the result jumps."""
+    _, alpha, light, depth = found
+    margins = [alpha.new_ones((len(alpha), 1)), (alpha / LEAST_ALPHA - 1).abs()]
+    margins += [(light / cut - 1).abs() for cut in (LEAST_LIGHT, 0.5)]
+    gap = depth.diff().abs() / depth[1:] if len(depth) > 1 else depth.new_ones(1)
+    return torch.cat(margins, 1).amin(1).minimum(gap.amin()).view(found.raster.opacity.shape)

@@ -81,7 +81,8 @@ def _difference(means: Tensor, quaternions: Tensor, scales: Tensor, opacities: T
     given = [value.detach().requires_grad_() for value in inputs]
     colours, camera = _colours(len(means), DOUBLE), _camera(DOUBLE)
     with torch.enable_grad():
-        exact, margin = reference.rasterize_with_margin(wide[0], wide[1], wide[2], wide[3], colours, camera)
+        composite = reference.composite(wide[0], wide[1], wide[2], wide[3], colours, camera)
+        exact, margin = composite.raster, reference.margin(composite)
         narrow = colours.to(means), camera.to(dtype=means.dtype)
         found = draw(given[0], given[1], given[2], given[3], *narrow)
         decided = margin > _DECIDED

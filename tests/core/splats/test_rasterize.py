@@ -133,8 +133,8 @@ def test_the_kernels_agree_with_the_reference(count: int, dtype: torch.dtype, an
     """Values and gradients with respect to everything, also in a window of the image."""
     c, window = camera(), Window(5, 3, 29, 31)
     exact = [value.requires_grad_() for value in inputs(gaussians(count, seed=count))]
-    wanted, margin = reference.rasterize_with_margin(*exact, c, window, antialias)
-    decided = margin > UNDECIDED
+    found = reference.composite(*exact, c, window, antialias)
+    wanted, decided = found.raster, reference.margin(found) > UNDECIDED
     assert decided.double().mean() > 0.95
     generator = torch.Generator().manual_seed(2)
     weights = [torch.randn(part.shape, generator=generator, dtype=torch.float64) * decided for part in wanted[:3]]

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from flows.bench.scheduling import Clock, SimulatedWork
+from flows.bench.scheduling import Clock, SimulatedExecutor, SimulatedWork
 from flows.errors import WorkerError
 from flows.jobs.job import Job
-from flows.jobs.needs import Needs
 from flows.progress import meter
 from flows.workers.orders import Order
 from flows.workers.sharing import Sharing
@@ -20,20 +18,13 @@ from schemas.config import RunConfig
 from schemas.execution import ExecutionConfig
 
 
-class Losing:
+class Losing(SimulatedExecutor):
     """One worker, which is lost at its first `losses` batches."""
 
-    exclusive = True
-
     def __init__(self, losses: int, clock: Clock) -> None:
-        self.losses, self.clock, self.batches, self.given = losses, clock, 0, list[int]()
+        super().__init__(1, clock, 0.0)
+        self.losses, self.batches, self.given = losses, 0, list[int]()
         self.seen = False
-
-    def workers(self, needs: Needs) -> int:
-        return 1
-
-    def room(self, needs: Needs, out: Counter[Needs]) -> int:
-        return 1 - out.total()
 
     def submit(self, batch: Batch) -> None:
         self.batches += 1
@@ -49,15 +40,6 @@ class Losing:
         answers = [Answer(number=number, seconds=1.0, died=died) for number in self.given]
         self.given.clear()
         return answers
-
-    def wake(self) -> None:
-        pass
-
-    def take_back(self, batch: Batch) -> list[int]:
-        return []
-
-    def close(self) -> None:
-        pass
 
 
 class Signing(SimulatedWork):
