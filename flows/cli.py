@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -237,8 +238,9 @@ def results(
     from flows.commands.results import results_command
     from flows.object_storage import results_at
 
-    with results_at(out, writes=False) as now, results_at(against or out, writes=False) as before:
-        raise typer.Exit(1 if results_command(now, before if against else None) else 0)
+    other = results_at(against, writes=False) if against else nullcontext()
+    with results_at(out, writes=False) as now, other as before:
+        raise typer.Exit(1 if results_command(now, before) else 0)
 
 
 import flows.cli_develop  # noqa: E402, F401  (registers its commands, after those above)

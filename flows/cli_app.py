@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated
 
@@ -19,11 +18,12 @@ app = typer.Typer(
 def on_a_file_system(path: Path) -> Path:
     """The folder as it was given. Raises InputError for an address such as s3://bucket/folder."""
     from flows.errors import InputError
+    from flows.object_storage import address_of
 
-    if found := re.match(r"([a-zA-Z][a-zA-Z0-9+]+):/+", str(path)):
+    if address := address_of(path):
         raise InputError(
-            f"{found[1]}://{str(path)[found.end() :]} is not on a file system, and this command needs a folder that is."
-            " Commands that take s3://BUCKET/FOLDER: run, sweep, reprocess, results, inspect, export."
+            f"{address} is not on a file system, and this command needs a folder that is. Commands that take "
+            "s3://BUCKET/FOLDER: run, sweep, reprocess, results, inspect, export."
         )
     return path
 

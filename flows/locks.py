@@ -1,4 +1,4 @@
-"""One writer at a time: a lock file beside what is written."""
+"""One writer at a time: a lock file beside what is written. And which process that is, and whether it lives."""
 
 from __future__ import annotations
 
@@ -11,9 +11,26 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
+import psutil
+
 from flows.errors import InputError, WorkerError
 
 RETRY_S = 0.2
+
+
+def this_process() -> str:
+    """What a lock or claim says of its holder."""
+    return f"process {os.getpid()} of {platform.node()}"
+
+
+def lives(pid: int, since: float | None = None) -> bool:
+    """Whether the process of this machine is there, and is no later one of the same number: it had begun by `since`
+    (seconds of the epoch)."""
+    try:
+        began = psutil.Process(pid).create_time()
+    except psutil.NoSuchProcess:
+        return False
+    return since is None or began <= since
 
 
 @contextlib.contextmanager
@@ -56,7 +73,7 @@ def _locked(file: IO[str]) -> bool:
     except OSError:
         return False
     file.truncate(0)
-    file.write(f"process {os.getpid()} of {platform.node()}")
+    file.write(this_process())
     file.flush()
     return True
 

@@ -6,7 +6,6 @@ It also says which working copy was copied there last, how often that happened, 
 from __future__ import annotations
 
 import json
-import os
 import platform
 import threading
 import time
@@ -15,11 +14,11 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import obstore
-import psutil
 from obstore.exceptions import AlreadyExistsError, BaseError, NotFoundError, PreconditionError
 from obstore.store import S3Store
 
 from flows.errors import InputError, WorkerError
+from flows.locks import lives, this_process
 from flows.progress import console
 
 NAME = ".cat3d.json"
@@ -65,7 +64,7 @@ class Claim:
 
     def __init__(self, store: S3Store, address: str) -> None:
         self.store, self.address = store, address
-        self.me = f"process {os.getpid()} of {platform.node()}"
+        self.me = this_process()
         self.state = State()
         self.tag: str | None = None
         self.lock, self.over = threading.RLock(), threading.Event()
@@ -120,7 +119,7 @@ class Claim:
         """Whether the holder of the state that was read is gone: looked up on this machine, waited for on others."""
         pid, _, host = self.state.holder.removeprefix("process ").partition(" of ")
         if host == platform.node():
-            return not (pid.isdigit() and psutil.pid_exists(int(pid)))
+            return not (pid.isdigit() and lives(int(pid)))
         console.print(f"Waiting to see whether {self.state.holder}, which last wrote {self.address}, still lives.")
         seen, deadline = self.tag, time.monotonic() + 3 * BEAT_S
         while time.monotonic() < deadline:

@@ -14,6 +14,7 @@ import uuid
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from datetime import timedelta
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -33,7 +34,7 @@ THREADS = 8
 #: Folders of tables, whose files belong to runs; everything else belongs to the scene of its first folder.
 TABLES = ("metrics", "timings")
 #: A connection that fails is tried again for so long.
-RETRIES = {"max_retries": 6, "retry_timeout": 60.0}
+RETRIES: Any = {"max_retries": 6, "retry_timeout": timedelta(seconds=60)}
 
 
 class Mirror:
@@ -42,7 +43,7 @@ class Mirror:
     def __init__(self, address: Address) -> None:
         self.address, self.folder = address, address.working_copy()
         with self._naming():
-            self.store = S3Store.from_url(str(address), client_options=_client_options(), retry_config=_retries())
+            self.store = S3Store.from_url(str(address), client_options=_client_options(), retry_config=RETRIES)
         self.claim = Claim(self.store, str(address))
         self.next = 0.0
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -77,24 +78,31 @@ class Mirror:
         """Copy to the bucket what is new or changed in the working copy, and remove there what is gone."""
         started = time.monotonic()
         found = dict(_files(self.folder))
-        records = {p: (self.folder / p).read_bytes() for p in found if "stages" in PurePosixPath(p).parts}
         changed = [p for p, stat in found.items() if self.index.stat(p) != stat]
+        records = {p: self._read(p, found[p]) for p in changed if "stages" in PurePosixPath(p).parts}
         gone = [p for p in self.index.files if p not in found]
         if not changed and not gone:
             return
         with self._naming():
-            touched = sorted({_part(p) for p in (*changed, *gone)})
             state = self.claim.state
-            self.claim.change(
-                writer=self.index.name, generation=state.generation + 1, touched=(*touched, *state.touched)
-            )
+            touched = sorted({*map(_part, (*changed, *gone)), *state.touched})
+            self.claim.change(writer=self.index.name, generation=state.generation + 1, touched=tuple(touched))
             self._each(gone, self._remove, None)
             self._each([p for p in changed if p not in records], lambda p: self._put(p, found[p]), "copying to S3")
-            self._each([p for p in changed if p in records], lambda p: self._put(p, found[p], records[p]), None)
+            self._each([p for p, data in records.items() if data], lambda p: self._put(p, found[p], records[p]), None)
             self.index.write()
             self.claim.change(touched=())
         ended = time.monotonic()
         self.next = ended + 20 * (ended - started)  # copying takes at most a twentieth of the time
+
+    def _read(self, path: str, stat: tuple[int, int]) -> bytes | None:
+        """A record as it was when its stage's data were listed; None where it was changed since: it is for the next
+        copying, with the data that it speaks of."""
+        try:
+            data = (self.folder / path).read_bytes()
+            return data if _stat(self.folder / path) == stat else None
+        except FileNotFoundError:
+            return None
 
     def _put(self, path: str, stat: tuple[int, int], data: bytes | None = None) -> None:
         try:
@@ -255,9 +263,3 @@ def _client_options() -> Any:
     """Servers on this machine and in closed networks speak HTTP: allowed where the endpoint that is given says so."""
     endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
     return {"allow_http": True} if endpoint.startswith("http://") else {}
-
-
-def _retries() -> Any:
-    from datetime import timedelta
-
-    return {"max_retries": RETRIES["max_retries"], "retry_timeout": timedelta(seconds=RETRIES["retry_timeout"])}

@@ -11,12 +11,10 @@ import platform
 import re
 import threading
 import time
-from datetime import datetime
 from pathlib import Path
 from typing import Any, cast
 from uuid import UUID
 
-import psutil
 from prefect.artifacts import (
     create_link_artifact,
     create_markdown_artifact,
@@ -37,6 +35,7 @@ from prefect.client.schemas.objects import StateType
 from prefect.context import FlowRunContext
 from prefect.states import Crashed, State
 
+from flows.locks import lives
 from flows.reporting.report import REPORT
 from flows.reporting.summary import markdown, paper_tables, summary_rows
 
@@ -62,7 +61,8 @@ def settle(client: SyncPrefectClient) -> list[UUID]:
     settled = []
     for run in client.read_flow_runs(flow_run_filter=FlowRunFilter(state=running)):
         host, _, pid = (run.infrastructure_pid or "").rpartition(":")
-        if host != platform.node() or not pid.isdigit() or _lives(int(pid), run.start_time):
+        since = run.start_time.timestamp() if run.start_time else None
+        if host != platform.node() or not pid.isdigit() or lives(int(pid), since):
             continue
         state: State[Any] = Crashed(
             message=f"Its process {pid} on {host} is gone: it was killed. Run it again to go on."
@@ -78,15 +78,6 @@ def settle(client: SyncPrefectClient) -> list[UUID]:
             client.set_task_run_state(task.id, state, force=True)
         settled.append(run.id)
     return settled
-
-
-def _lives(pid: int, since: datetime | None) -> bool:
-    """Whether the process is there, and is not a later one of the same number."""
-    try:
-        began = psutil.Process(pid).create_time()
-    except psutil.NoSuchProcess:
-        return False
-    return since is None or began <= since.timestamp()
 
 
 def is_deployed() -> bool:

@@ -245,7 +245,7 @@ def test_every_call_to_the_storage_fails_once_in_turn(
 
     for name in calls:
         monkeypatch.setattr(obstore, name, counted(name))
-    monkeypatch.setattr(claim.psutil, "pid_exists", lambda pid: False)  # each command was a process of its own
+    monkeypatch.setattr(claim, "lives", lambda pid: False)  # each command was a process of its own
     monkeypatch.setattr(mirror, "THREADS", 1)
 
     def command(address: Path) -> None:
@@ -273,3 +273,25 @@ def test_every_call_to_the_storage_fails_once_in_turn(
         monkeypatch.setenv("CAT3D_WORK", str(tmp_path / "work"))
     assert len(told) >= 9, "calls of a command that changes three files and removes one"
     assert all("cannot be used: Generic S3 error: connection reset" in sentence for sentence in told)
+
+
+def test_a_record_written_after_its_data_were_listed_is_for_the_next_copying(
+    bucket: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = mirror._files
+
+    def listed(folder: Path) -> Any:
+        found = list(files(folder))
+        if (folder / "a.zarr").exists():
+            write(folder, {"a.zarr/c/0": "newer", "a.zarr/stages/plan.json": "of the newer"})
+        return found
+
+    with results_at(ADDRESS) as folder:
+        write(folder, {"a.zarr/c/0": "1", "a.zarr/stages/plan.json": "of 1"})
+        monkeypatch.setattr(mirror, "_files", listed)
+    assert "a.zarr/stages/plan.json" not in keys(bucket)
+    monkeypatch.setattr(mirror, "_files", files)
+    with results_at(ADDRESS):
+        pass
+    record = bucket.get_object(Bucket="results", Key="team/first/a.zarr/stages/plan.json")
+    assert record["Body"].read() == b"of the newer"
