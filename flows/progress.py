@@ -33,15 +33,16 @@ class Meter:
         if self._progress is not None and self._task is not None:
             self._progress.update(self._task, completed=done, total=total, note=note)
 
-    def update(self, done: int, note: str = "") -> None:
-        """Set the number of finished units."""
+    def update(self, done: int, note: str = "", left: float | None = None) -> None:
+        """Set the number of finished units. left: seconds until the end, where more is known than the pace so far."""
         self.done, self.note = done, note
         if self._progress is not None and self._task is not None:
-            self._progress.update(self._task, completed=done, total=self.total, note=note)
+            told = note or ("" if left is None else time_left(left))
+            self._progress.update(self._task, completed=done, total=self.total, note=told)
         elif not self.quiet and time.monotonic() - self._spoke > PLAIN_INTERVAL_S:
             self._spoke = time.monotonic()
-            elapsed = self._spoke - self._started
-            left = elapsed / max(done, 1) * (self.total - done)
+            if left is None:
+                left = (self._spoke - self._started) / max(done, 1) * (self.total - done)
             text = f"  {self.label}: {done}/{self.total}, about {left:.0f} s left {note}"
             console.print(text, markup=False)
 
@@ -49,6 +50,11 @@ class Meter:
         """Take it off the display."""
         if self._progress is not None and self._task is not None:
             self._progress.remove_task(self._task)
+
+
+def time_left(seconds: float) -> str:
+    """In words."""
+    return f"about {seconds / 60:.0f} min left" if seconds > 90 else f"about {seconds:.0f} s left"
 
 
 class _Display:

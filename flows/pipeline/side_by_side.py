@@ -21,7 +21,7 @@ from flows.jobs.job import Job
 from flows.pipeline.costs import Costs, Outlook
 from flows.pipeline.keys import Step, expected_steps, pending, stages_of
 from flows.pipeline.runner import opened, run_missing
-from flows.progress import Meter, meter
+from flows.progress import Meter, meter, time_left
 from flows.workers.fan_out import open_pool
 from flows.workers.sharing import Sharing
 from schemas.layout import SCENE_STAGES
@@ -141,11 +141,10 @@ class _Doing:
             record = self.perform(job, step)
         self.outlook.done(job, step.stage, record.seconds)
         done, left = self.steps - self.outlook.steps_left(), self.outlook.seconds_left(self._workers())
-        note = "" if left is None else _told(left)
         if self.meter is not None:
-            self.meter.update(done, note)
+            self.meter.update(done, left=left)
         if self.advanced is not None:
-            self.advanced(done, self.steps, note)
+            self.advanced(done, self.steps, "" if left is None else time_left(left))
         return record
 
     def _workers(self) -> int:
@@ -240,7 +239,3 @@ def shared_keys(job: Job) -> dict[str, str]:
         if one.name in SCENE_STAGES and not (one.passing and not readers & missing):
             keys[one.name] = steps[one.name].key
     return keys
-
-
-def _told(seconds: float) -> str:
-    return f"about {seconds / 60:.0f} min left" if seconds > 90 else f"about {seconds:.0f} s left"

@@ -101,10 +101,10 @@ def victims(command: psutil.Process, cluster: Cluster | None) -> dict[str, psuti
     if cluster is not None:
         for name, process in cluster.processes.items():
             if process.poll() is None:
-                nannied = psutil.Process(process.pid).children() if "worker" in name else []
-                found[name] = nannied[0] if nannied and "resource_tracker" not in " ".join(
-                    nannied[0].cmdline()
-                ) else psutil.Process(process.pid)  # fmt: skip
+                found[name] = psutil.Process(process.pid)
+                for child in found[name].children() if "worker" in name else []:
+                    if "spawn_main" in " ".join(child.cmdline()):  # what does the work, and not its keeper
+                        found[name] = child
     return found
 
 
