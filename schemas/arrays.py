@@ -6,6 +6,7 @@ the fill value: here it is an error. So empty (all-zero) chunks are always writt
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -97,8 +98,15 @@ def create(
 
 def open_array(folder: Path, writable: bool) -> zarr.Array:
     """The zarr array in `folder`. Raises MissingError or StoreError."""
-    if read_metadata(folder)["node_type"] != "array":
+    document = read_metadata(folder)
+    if document["node_type"] != "array":
         raise StoreError(f"{folder} is a Zarr group, where an array was expected.")
+    return _opened(folder, writable, json.dumps(document, sort_keys=True))
+
+
+@functools.lru_cache(maxsize=256)
+def _opened(folder: Path, writable: bool, document: str) -> zarr.Array:
+    """The same, once for each `document` that its metadata have been: opening takes as long as reading a small view."""
     try:
         array = zarr.open_array(str(folder), mode="r+" if writable else "r", zarr_format=3)
     except FileNotFoundError:  # removed by a writer since its metadata was read
@@ -151,7 +159,7 @@ def read(folder: Path, views: Sequence[int] | None = None) -> NDArray[Any]:
     if array.chunks[0] != 1:
         return read(folder)[rows]
     out = _room(folder, array, (len(rows), *array.shape[1:]))
-    for i, row in enumerate(read_views(folder, rows.tolist())):
+    for i, row in enumerate(_views(folder, array, rows.tolist())):
         if isinstance(row, StoreError):
             raise row
         out[i] = row
@@ -169,7 +177,11 @@ def _room(folder: Path, array: zarr.Array, shape: tuple[int, ...]) -> NDArray[An
 def read_views(folder: Path, views: Sequence[int]) -> Iterator[NDArray[Any] | StoreError]:
     """Views of an array that is stored view by view, one at a time; a StoreError in place of one that can't be read."""
     array = open_array(folder, writable=False)
-    for row in check_views(folder, views, array.shape).tolist():
+    yield from _views(folder, array, check_views(folder, views, array.shape).tolist())
+
+
+def _views(folder: Path, array: zarr.Array, rows: Sequence[int]) -> Iterator[NDArray[Any] | StoreError]:
+    for row in rows:
         try:
             yield read_chunk(folder, array, (row,) + (0,) * (array.ndim - 1))[0]
         except StoreError as error:

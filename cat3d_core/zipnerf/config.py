@@ -163,10 +163,14 @@ _PAPER = ZipNerfConfig()
 
 # For two CPU cores and small images: a scene in seconds (tiny), about a minute or two (fast), or over ten (balanced).
 # One proposal round did as well as two at equal cost on fox (27.3 against 26.6 dB) and fern at 3 views (25.4 against
-# 24.9). At 200 iterations of a procedural mip360 scene: 27.4 dB in 13.4 CPU seconds; half the samples 26.2 dB in 7.8;
-# three multisamples instead of six 27.3 dB in 10.4.
+# 24.9). Half the samples cost 1.2 dB. Three multisamples instead of six cost nothing, and with small batches a learning rate
+# that ends higher gains 0.3 dB: so 800 steps do what 1,000 did (docs/log/2026-11-29_speed.md).
 _FAST = replace(
     _PAPER,
+    iterations=800,
+    warmup_iterations=80,
+    lr_final=0.003,
+    multisamples=3,
     batch_rays=1024,
     chunk_rays=1024,
     patch_size=24,  # LPIPS networks need 16 to 31 pixels; ST-LPIPS AlexNet, the default here, 21
@@ -188,12 +192,13 @@ _FAST = replace(
 
 PRESETS: dict[str, ZipNerfConfig] = {
     "tiny": replace(
-        _FAST, iterations=100, warmup_iterations=10, batch_rays=768, chunk_rays=768,
-        samples=(16, 12), grid_max=(64, 128), grid_log2_table=14, multisamples=3,
+        _FAST, iterations=100, warmup_iterations=10, lr_final=0.001, batch_rays=768, chunk_rays=768,
+        samples=(16, 12), grid_max=(64, 128), grid_log2_table=14,
     ),
     "fast": _FAST,
     "balanced": replace(
-        _FAST, iterations=2500, warmup_iterations=250, batch_rays=4096, chunk_rays=4096, patch_size=32,
+        _FAST, iterations=2500, warmup_iterations=250, lr_final=0.001, multisamples=6,
+        batch_rays=4096, chunk_rays=4096, patch_size=32,
         lpips_weight=0.1, samples=(48, 48, 24), grid_max=(256, 512, 2048), grid_features=(1, 1, 4),
         interlevel_blur=(0.03, 0.003),
         grid_log2_table=18, density_width=64,

@@ -37,6 +37,8 @@ class GridDensity(nn.Module):
         self.hidden = nn.Linear(self.layout.levels * (self.layout.features + 1), config.density_width)
         self.density = nn.Linear(config.density_width, 1)
         self.final = round_index == config.rounds - 1
+        rows = [last - first for first, last in self.level_rows()]
+        self.register_buffer("numbers", torch.tensor(rows) * self.layout.features, persistent=False)
 
     def level_rows(self) -> list[tuple[int, int]]:
         return list(zip(self.layout.offsets[:-1], self.layout.offsets[1:], strict=True))
@@ -57,10 +59,9 @@ class GridDensity(nn.Module):
         are linear, so the weights take them over."""
         weight = self.hidden.weight.view(-1, self.layout.levels, self.layout.features + 1)
         with torch.no_grad():
-            counts = [b - a for a, b in self.level_rows()]
-            norms = torch.stack(torch._foreach_norm(self.table.detach().split(counts)))
-            numbers = torch.tensor(counts, device=norms.device) * self.layout.features
-            size = self.gain * (self.init**2 + norms.square() / numbers).sqrt()
+            levels = self.table.detach().split([last - first for first, last in self.level_rows()])
+            norms = torch.stack(torch._foreach_norm(levels))
+            size = self.gain * (self.init**2 + norms.square() / self.get_buffer("numbers")).sqrt()
             scale = torch.full_like(weight[0], self.gain)
             scale[:, -1] = 2.0 * size
         bias = self.hidden.bias - weight[..., -1] @ size

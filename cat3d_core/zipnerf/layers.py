@@ -105,9 +105,9 @@ def chain(x: Tensor, layers: Sequence[Layer], shown: Sequence[bool]) -> list[Ten
         if len(x) % len(added):
             raise ValueError(f"{len(x)} rows are not {len(added)} groups of one size.")
         inputs = weight.shape[:1]
-    narrow = max(max(layer.weight.shape) for layer in layers) <= WIDEST and len(layers) <= LONGEST
-    kernel = x.dtype == torch.float32 and x.device.type == "cpu" and narrow and len(x) > 0
-    if not kernel or library("zipnerf/layers") is None:
-        return [out for out, show in zip(chain_reference(x, layers), shown, strict=True) if show]
     both = [layer.weight for layer in layers] + [layer.added for layer in layers]
+    narrow = max(max(layer.weight.shape) for layer in layers) <= WIDEST and len(layers) <= LONGEST
+    plain = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in (x, *both))
+    if not (plain and narrow and len(x)) or library("zipnerf/layers") is None:
+        return [out for out, show in zip(chain_reference(x, layers), shown, strict=True) if show]
     return list(_Chain.apply(x, tuple(layer.relu for layer in layers), tuple(shown), *both))

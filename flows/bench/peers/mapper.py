@@ -14,6 +14,7 @@ import torch
 from cat3d_core.alignment import pose_errors
 from cat3d_core.cameras import Cameras
 from flows.bench.poses import measure as ours
+from flows.media.images import read_image, write_png
 from flows.readers import read_capture
 from flows.readers.splits import linspace_ids
 from flows.sfm.colmap import pycolmap
@@ -28,14 +29,17 @@ def measure(task: Task) -> list[Row]:
     rows = [{"who": "cat3d", "setting": "poses"} | {name: row[name] for name in kept if name in row}]
     capture = read_capture(scene)
     ids = linspace_ids(range(len(capture)), min(views, len(capture)))
-    started = time.perf_counter()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         images, database = folder / "images", folder / "database.db"
         images.mkdir()
         for view in ids:
             path = capture.paths[view]
-            (images / f"{view:05d}{path.suffix}").symlink_to(path.resolve())
+            if path.suffix.lower() in (".jpg", ".jpeg", ".png"):
+                (images / f"{view:05d}{path.suffix}").symlink_to(path.resolve())
+            else:  # such as WebP, which COLMAP does not read
+                write_png(images / f"{view:05d}.png", read_image(path)[0])
+        started = time.perf_counter()
         pycolmap.extract_features(database, images)
         pycolmap.match_exhaustive(database)
         models = pycolmap.incremental_mapping(database, images, folder / "sparse")
