@@ -19,20 +19,35 @@ class Rays(NamedTuple):
     radii: Tensor
 
 
-def pixel_rays(cameras: Cameras, view: Tensor, xy: Tensor) -> Rays:
-    """Rays through image points.
+class Pinholes(NamedTuple):
+    """What the rays of N cameras follow from: K^-1, rotation (N, 3, 3), centers (N, 3), radii of cones (N, 1)."""
 
-    view (R,) int64: which camera; xy (R, 2): image coordinates in pixels (the centre of pixel (i, j) is i+0.5, j+0.5).
-    The cone radius follows mip-NeRF / Zip-NeRF: the mean of the distances to the rays one pixel to the right and one
-    pixel down, times 2 / sqrt(12), so that the cone's variance is that of the pixel's footprint.
-    """
-    inverse_k = _inverse_intrinsics(cameras.intrinsics)[view]
-    rotation = cameras.rotation[view]
-    homogeneous = torch.cat([xy, torch.ones_like(xy[:, :1])], -1)
-    directions = (rotation @ (inverse_k @ homogeneous[..., None]))[..., 0]
-    # d(direction)/dx and /dy are the columns of R K^-1 (rotation keeps lengths, so K^-1 alone gives the norms).
-    step = inverse_k[:, :, :2].norm(dim=1).mean(-1, keepdim=True)
-    return Rays(cameras.centers[view], directions, step * 2 / 12**0.5)
+    inverse_k: Tensor
+    rotation: Tensor
+    centers: Tensor
+    radii: Tensor
+
+    @classmethod
+    def of(cls, cameras: Cameras) -> Pinholes:
+        """The cone radius follows mip-NeRF / Zip-NeRF: the mean of the distances to the rays one pixel to the right and
+        one pixel down, times 2 / sqrt(12), so that the cone's variance is that of the pixel's footprint."""
+        inverse_k = _inverse_intrinsics(cameras.intrinsics)
+        # d(direction)/dx and /dy are the columns of R K^-1 (rotation keeps lengths, so K^-1 alone gives the norms).
+        step = inverse_k[:, :, :2].norm(dim=1).mean(-1, keepdim=True)
+        return cls(inverse_k, cameras.rotation, cameras.centers, step * 2 / 12**0.5)
+
+    def rays(self, view: Tensor, xy: Tensor) -> Rays:
+        """Rays through image points: view (R,) int64, which camera; xy (R, 2) in pixels (the centre of pixel (i, j) is
+        i+0.5, j+0.5)."""
+        homogeneous = torch.cat([xy, torch.ones_like(xy[:, :1])], -1)
+        local = (self.inverse_k[view] * homogeneous[:, None]).sum(-1)
+        directions = (self.rotation[view] * local[:, None]).sum(-1)
+        return Rays(self.centers[view], directions, self.radii[view])
+
+
+def pixel_rays(cameras: Cameras, view: Tensor, xy: Tensor) -> Rays:
+    """`Pinholes.rays` of these cameras; who draws many times keeps the pinholes."""
+    return Pinholes.of(cameras).rays(view, xy)
 
 
 def image_rays(cameras: Cameras, view: int, width: int | None = None, height: int | None = None) -> Rays:

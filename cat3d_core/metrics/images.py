@@ -1,9 +1,20 @@
-"""The one check that every image metric makes of its arguments."""
+"""What image metrics share: the check of their arguments, and the kernels of images.cpp."""
 
 from __future__ import annotations
 
+import ctypes
+
 import torch
 from torch import Tensor
+
+from cat3d_core.cpu_library import library
+
+
+def kernels_for(prediction: Tensor, target: Tensor) -> ctypes.CDLL | None:
+    """The kernels, if they take these images: float32 on the CPU, and nobody asks for gradients."""
+    wanted = torch.is_grad_enabled() and (prediction.requires_grad or target.requires_grad)
+    plain = all(x.dtype == torch.float32 and x.device.type == "cpu" for x in (prediction, target))
+    return library("metrics/images") if plain and not wanted else None
 
 
 def image_pair(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from cat3d_core.cameras import Cameras
+from cat3d_core.rays import Pinholes
 from cat3d_core.reconstruction.buffers import Maps, flat_maps, flat_shares, pixel_buffer
 
 
@@ -77,6 +78,20 @@ class Views:
     def size(self) -> Tensor:
         """(N, 2) width and height in pixels."""
         return self.cameras.size
+
+    @cached_property
+    def pinholes(self) -> Pinholes:
+        """What the rays of the cameras follow from."""
+        return Pinholes.of(self.cameras)
+
+    @cached_property
+    def shares(self) -> tuple[Tensor, Tensor, Tensor]:
+        """How captured and generated views share draws among themselves, (N,) both, each as often as it has pixels that
+        count, of all of its own; and the captured ones' share of all."""
+        whole = self.counting / self.size.prod(-1)
+        captured, generated = whole * self.captured, whole * ~self.captured
+        share = captured.sum() / whole.sum().clamp_min(1e-9)
+        return captured / captured.sum().clamp_min(1e-9), generated / generated.sum().clamp_min(1e-9), share
 
     @cached_property
     def offset(self) -> Tensor:
@@ -229,13 +244,10 @@ class Batch:
 def draw_views(views: Views, count: int, captured_share: float, generator: torch.Generator) -> Tensor:
     """`count` views, each as often as it has pixels that count, of all of its own; but captured views together have at
     least the probability `captured_share`."""
-    whole = views.counting / views.size.prod(-1)
-    captured, generated = whole * views.captured, whole * ~views.captured
-    share = captured.sum() / whole.sum().clamp_min(1e-9)
+    captured, generated, share = views.shares
     if 0 < share < 1:
         share = share.clamp_min(captured_share)
-    probability = captured * share / captured.sum().clamp_min(1e-9)
-    probability = probability + generated * (1 - share) / generated.sum().clamp_min(1e-9)
+    probability = captured * share + generated * (1 - share)
     if not probability.any():  # no pixel counts: there is nothing to learn, and nothing to fail at
         probability = torch.ones_like(probability)
     return torch.multinomial(probability, count, replacement=True, generator=generator)

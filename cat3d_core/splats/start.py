@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cat3d_core.rays import Rays, pixel_rays
+from cat3d_core.rays import Rays
 from cat3d_core.reconstruction.views import Views, draw_views
 from cat3d_core.splats.config import SplatConfig
 from cat3d_core.splats.gaussians import Gaussians, harmonics_of_colour
@@ -35,7 +35,7 @@ def start(views: Views, config: SplatConfig, generator: torch.Generator) -> Gaus
     xy = views.pixel(view, (number * views.counting[view]).long().clamp_max(views.counting[view] - 1).clamp_min(0))
     seen = views.batch(view, xy, 1)
     colour = seen.rgb
-    rays = pixel_rays(views.cameras, view, xy + 0.5)
+    rays = views.pinholes.rays(view, xy + 0.5)
     jitter = torch.rand((count, DEPTHS), generator=generator, device=device)
     share = (torch.arange(DEPTHS, device=device) + jitter) / DEPTHS
     depths = 1.0 / (1.0 / config.near + share * (1.0 / config.far - 1.0 / config.near))

@@ -8,7 +8,7 @@ from torch import Tensor
 from cat3d_core.rays import Rays, perpendicular_basis
 from cat3d_core.stress.draw import Draw
 from cat3d_core.stress.routine import DOUBLE, ROUNDING, SINGLE, Exact, Routine, zero
-from cat3d_core.zipnerf import stepfun
+from cat3d_core.zipnerf import ray_intervals, stepfun
 from cat3d_core.zipnerf.frustums import (
     cone_samples,
     grid_samples,
@@ -69,7 +69,7 @@ def _invert(t: Tensor, w: Tensor, u: Tensor, shift: Tensor) -> Tensor:
 def _intervals(t: Tensor, w: Tensor) -> Tensor:
     """By how much the new edges are out of order or out of [0, 1]."""
     logits = w.clamp_min(torch.finfo(w.dtype).tiny).log()
-    edges = stepfun.sample_intervals(t, logits, 9)
+    edges = ray_intervals.sample_intervals(t, logits, 9)
     bad = (-edges.diff(dim=-1)).clamp_min(0).sum(-1) + (edges - 1).clamp_min(0).sum(-1) + (-edges).clamp_min(0).sum(-1)
     return torch.where(torch.isfinite(edges).all(-1), bad, torch.inf)
 
@@ -202,7 +202,7 @@ ROUTINES = [
         _invert_inputs, _invert, zero, ROUNDING,
     ),
     Routine(
-        "stepfun.sample_intervals", "ordered and inside [0, 1], rays without weight too",
+        "stepfun.sample_intervals", "ordered and inside [0, 1], rays without weight too; in float32 the kernel",
         _histogram, _intervals, zero, {DOUBLE: 1e-15, SINGLE: 2e-7},
     ),
     Routine(
@@ -211,7 +211,8 @@ ROUTINES = [
         {DOUBLE: 2e-13, SINGLE: 2e-7},
     ),
     Routine(
-        "stepfun.distortion", "value and gradient, never negative", _far_histogram, stepfun.distortion,
+        "stepfun.distortion", "value and gradient, never negative; in float32 the kernel",
+        _far_histogram, ray_intervals.distortion,
         _distortion_reference, ROUNDING, ROUNDING, wrt=(1,),
     ),
     Routine(

@@ -17,10 +17,11 @@ from cat3d_core.zipnerf.gradients import safe_exp
 from cat3d_core.zipnerf.grid_layout import PRIMES, GridLayout, make_layout
 from cat3d_core.zipnerf.grid_reference import level_weights, query_reference
 from cat3d_core.zipnerf.hash_grid import query
+from cat3d_core.zipnerf.layers import Layer, chain
 from cat3d_core.zipnerf.render import Round, expected_depth, weights_from_density
 
 _BINS = 10
-Query = Callable[[Tensor, Tensor, Tensor, GridLayout], tuple[Tensor, Tensor]]
+Query = Callable[[Tensor, Tensor, Tensor, GridLayout], Tensor]
 _LAYOUT = make_layout(16, 256, 10, 2)  # a level of 16^3 and one of 32^3 do not fit 2^10 rows: all levels are hashed
 _DENSE = make_layout(16, 32, 15, 2)  # both levels fit: zero outside the cube
 
@@ -126,8 +127,7 @@ def _table(layout: GridLayout, dtype: torch.dtype) -> Tensor:
 
 def _query(layout: GridLayout, function: Query) -> Call:
     def call(positions: Tensor, std: Tensor) -> Tensor:
-        features, weights = function(_table(layout, positions.dtype), positions, std, layout)
-        return torch.cat([features, weights[..., None]], -1).flatten(1)
+        return function(_table(layout, positions.dtype), positions, std, layout).flatten(1)
 
     return call
 
@@ -170,7 +170,7 @@ def _table_gradient(positions: Tensor, std: Tensor) -> Tensor:
     for function in (query, query_reference):
         wide = function is query_reference
         table = _table(_LAYOUT, torch.float64 if wide else positions.dtype).requires_grad_()
-        features, _ = function(table, positions.to(table.dtype)[None], std.to(table.dtype)[None], _LAYOUT)
+        features = function(table, positions.to(table.dtype)[None], std.to(table.dtype)[None], _LAYOUT)[..., :-1]
         weight = torch.cos(torch.arange(features.numel(), dtype=torch.float64)).view(features.shape)
         with torch.enable_grad():
             (gradient,) = torch.autograd.grad((features * weight.to(features.dtype)).sum(), table)
@@ -183,6 +183,60 @@ def _gradient_call(positions: Tensor, std: Tensor) -> Tensor:
         return each(_table_gradient)(positions, std)
 
 
+_WIDTHS, _GROUP = (5, 20, 3, 17), 2
+
+
+def _row_inputs(draw: Draw) -> tuple[Tensor, ...]:
+    return (draw.normal(_GROUP * _WIDTHS[0]).view(-1, _GROUP, _WIDTHS[0]) * draw.log_between(1, 1e-6, 1e6)[..., None],)
+
+
+def _layers(count: int, dtype: torch.dtype) -> list[Layer]:
+    """The first adds the same to all rows, the second something to each case, the third nothing at all."""
+    draw = torch.Generator().manual_seed(0)
+    weights = [torch.randn(b, a, generator=draw).to(dtype) for a, b in itertools.pairwise(_WIDTHS)]
+    shared, zeros = torch.randn(1, _WIDTHS[1], generator=draw), torch.zeros(1, _WIDTHS[3])
+    own = torch.cos(torch.arange(_WIDTHS[2]) + torch.arange(count)[:, None] % 7)
+    added = [each.to(dtype) for each in (shared, own, zeros)]
+    return [Layer(*each) for each in zip(weights, added, (True, False, True), strict=True)]
+
+
+def _chain(rows: Tensor) -> Tensor:
+    if not len(rows):
+        return rows.new_zeros(0, _GROUP, _WIDTHS[3])
+    [out] = chain(rows.flatten(0, 1), _layers(len(rows), rows.dtype), (False, False, True))
+    return out.view(-1, _GROUP, _WIDTHS[3])
+
+
+def _chain_steps(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """The answer in float64 and the size of the sums that it is made of."""
+    x, size = rows, rows.detach().abs()
+    for weight, added, relu in _layers(len(rows), torch.float64):
+        own = added.expand(len(rows), -1)[:, None]
+        x = (x[..., None, :] * weight).sum(-1) + own
+        size = (size[..., None, :] * weight.abs()).sum(-1) + own.abs()
+        x = x.clamp(min=0) if relu else x
+    return x, size
+
+
+def _chain_reference(rows: Tensor) -> Exact:
+    return Exact(*_chain_steps(rows))
+
+
+def _chain_slope(rows: Tensor) -> tuple[Tensor]:
+    """The products of all weights. Near a bend, within rounding, either slope is right: such cases say nothing."""
+    slope = torch.ones(1, 1, dtype=torch.float64)
+    bent = torch.zeros(len(rows), dtype=torch.bool)
+    x, size = rows, rows.abs()
+    for weight, added, relu in _layers(len(rows), torch.float64):
+        own = added.expand(len(rows), -1)[:, None]
+        x = (x[..., None, :] * weight).sum(-1) + own
+        size = (size[..., None, :] * weight.abs()).sum(-1) + own.abs()
+        bent |= (relu & (x.abs() < 1e-5 * size)).flatten(1).any(1)
+        x = x.clamp(min=0) if relu else x
+        slope = weight.abs() @ slope.expand(weight.shape[1], -1)
+    return (torch.where(bent, torch.inf, float(slope.sum())),)
+
+
 def _encode_reference(d: Tensor) -> Exact:
     parts = [d] + [(2**k * d).sin() for k in range(4)] + [torch.sin(2**k * d + torch.pi / 2) for k in range(4)]
     value = torch.cat(parts, -1)
@@ -191,9 +245,13 @@ def _encode_reference(d: Tensor) -> Exact:
 
 ROUTINES = [
     Routine(
-        "render.weights_from_density", "fog of 1e-12 to walls of e^40, value and slope",
+        "render.weights_from_density", "fog of 1e-12 to walls of e^40, value and slope; in float32 the kernel",
         _density_inputs, weights_from_density, _weights_reference, ROUNDING,
         ROUNDING, gradient_scale=_weights_gradient_scale,
+    ),
+    Routine(
+        "layers.chain", "three narrow layers, rows of 1e-6 to 1e6, value and slope; in float32 the kernel",
+        _row_inputs, _chain, _chain_reference, ROUNDING, ROUNDING, gradient_scale=_chain_slope,
     ),
     Routine(
         "field.safe_exp", "exp with value and slope capped at e^40", lambda draw: (draw.between(1, -200, 200)[:, 0],),

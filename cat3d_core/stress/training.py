@@ -164,8 +164,9 @@ def _decay(rows: Tensor) -> Tensor:
     """The decay's share of the gradient, over two groups of rows; gradients are zero otherwise."""
     parameter = rows.clone().requires_grad_()
     parameter.grad = torch.zeros_like(rows)
-    Adam({"x": parameter}, {"x": [(0, 3, _DECAY), (3, 8, 2 * _DECAY)]}, _BETA1, _BETA2, _TINY).step(_LR)
-    return parameter.grad
+    adam = Adam({"x": parameter}, {"x": [(0, 3, _DECAY), (3, 8, 2 * _DECAY)]}, _BETA1, _BETA2, _TINY)
+    adam.step(_LR)
+    return adam.mean["x"] / (1 - _BETA1)
 
 
 def _decay_reference(rows: Tensor) -> Tensor:

@@ -25,18 +25,29 @@ inline float two_thirds_power(float v) {
     return y * y;
 }
 
+// rays.perpendicular_basis: two unit vectors orthogonal to d and to each other.
+inline void perpendicular(const float* d, float* u, float* v) {
+    const float size = std::sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
+    const float x = d[0] / size, y = d[1] / size, z = d[2] / size, sign = z < 0.f ? -1.f : 1.f;
+    const float a = -1.f / (sign + z), b = x * y * a;
+    u[0] = 1.f + sign * x * x * a, u[1] = sign * b, u[2] = -sign * x;
+    v[0] = b, v[1] = sign + y * y * a, v[2] = -y;
+}
+
 }  // namespace
 
-// origins, directions, first, second (R, 3), radii (R), t (R, N+1), flip, cosine, sine (R, N), spread, turn_cosine,
-// turn_sine (S) -> positions (R, N, S, 3) in the unit cube, std (R, N, S) in its units. Returns 1 for too many samples.
-extern "C" int cone_samples(const float* origins, const float* directions, const float* first, const float* second,
-                            const float* radii, const float* t, const float* flip, const float* cosine, const float* sine,
-                            const float* spread, const float* turn_cosine, const float* turn_sine, float* positions,
-                            float* std, int64_t rays, int intervals, int samples, int threads) {
+// origins, directions (R, 3), radii (R), t (R, N+1), flip, cosine, sine (R, N), spread, turn_cosine, turn_sine (S) ->
+// positions (R, N, S, 3) in the unit cube, std (R, N, S) in its units. Returns 1 for too many samples.
+extern "C" int cone_samples(const float* origins, const float* directions, const float* radii, const float* t,
+                            const float* flip, const float* cosine, const float* sine, const float* spread,
+                            const float* turn_cosine, const float* turn_sine, float* positions, float* std, int64_t rays,
+                            int intervals, int samples, int threads) {
     if (samples < 1 || samples > MAX_S) return 1;
 #pragma omp parallel for num_threads(threads) schedule(static)
     for (int64_t ray = 0; ray < rays; ++ray) {
-        const float *o = origins + 3 * ray, *d = directions + 3 * ray, *u = first + 3 * ray, *v = second + 3 * ray;
+        const float *o = origins + 3 * ray, *d = directions + 3 * ray;
+        float u[3], v[3];
+        perpendicular(d, u, v);
         const float width = radii[ray] * 0.70710678f;
         for (int begin = 0; begin < intervals; begin += B) {
             const int count = std::min(B, intervals - begin);

@@ -13,6 +13,7 @@ from cat3d_core.zipnerf.config import ZipNerfConfig
 from cat3d_core.zipnerf.gradients import safe_exp
 from cat3d_core.zipnerf.grid_layout import make_layout
 from cat3d_core.zipnerf.hash_grid import query
+from cat3d_core.zipnerf.layers import Layer, chain
 
 
 def encode_directions(unit: Tensor, degree: int) -> Tensor:
@@ -35,24 +36,35 @@ class GridDensity(nn.Module):
         self.table = nn.Parameter(torch.empty(self.layout.rows, self.layout.features))
         self.hidden = nn.Linear(self.layout.levels * (self.layout.features + 1), config.density_width)
         self.density = nn.Linear(config.density_width, 1)
+        self.final = round_index == config.rounds - 1
 
     def level_rows(self) -> list[tuple[int, int]]:
         return list(zip(self.layout.offsets[:-1], self.layout.offsets[1:], strict=True))
 
     def forward(self, positions: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
         """Cone samples (R, N, S, 3), (R, N, S) in the unit cube (`grid_samples`) -> density (R, N) per scene unit,
-        hidden units (R, N, width)."""
+        hidden units (R, N, width) for the colour; of proposals, which have none, width 0."""
         rays, intervals, samples = std.shape
-        features, weights = query(self.table, positions.reshape(-1, samples, 3), std.reshape(-1, samples), self.layout)
-        # Scale feature (Zip-NeRF sec. 2): tells the network how much of a level was weighted away.
+        found = query(self.table, positions.reshape(-1, samples, 3), std.reshape(-1, samples), self.layout)
+        layers = [self._first_layer(), Layer(self.density.weight, self.density.bias[None] + self.bias)]
+        *hidden, density = chain(found.flatten(1), layers, (self.final, True))
+        shown = hidden[0] if hidden else density[:, :0]
+        return safe_exp(density.view(rays, intervals)), shown.view(rays, intervals, -1)
+
+    def _first_layer(self) -> Layer:
+        """`hidden` as it reads what `query` gives: features times the gain, and of each level the scale feature
+        (2 weight - 1) sqrt(init^2 + mean square) (Zip-NeRF sec. 2), which tells how much of it was weighted away. Both
+        are linear, so the weights take them over."""
+        weight = self.hidden.weight.view(-1, self.layout.levels, self.layout.features + 1)
         with torch.no_grad():
-            norms = [torch.linalg.vector_norm(self.table[a:b]) for a, b in self.level_rows()]
-            counts = [(b - a) * self.layout.features for a, b in self.level_rows()]
-            power = torch.stack(norms).square() / torch.tensor(counts, device=weights.device)
-            scale = (2.0 * weights - 1.0) * (self.init**2 + power).sqrt()
-        inputs = torch.cat([features, scale[..., None]], -1).flatten(1) * self.gain
-        hidden = torch.relu(self.hidden(inputs)).view(rays, intervals, -1)
-        return safe_exp(self.density(hidden)[..., 0] + self.bias), hidden
+            counts = [b - a for a, b in self.level_rows()]
+            norms = torch.stack(torch._foreach_norm(self.table.detach().split(counts)))
+            numbers = torch.tensor(counts, device=norms.device) * self.layout.features
+            size = self.gain * (self.init**2 + norms.square() / numbers).sqrt()
+            scale = torch.full_like(weight[0], self.gain)
+            scale[:, -1] = 2.0 * size
+        bias = self.hidden.bias - weight[..., -1] @ size
+        return Layer((weight * scale).flatten(1), bias[None], True)
 
 
 class ViewColour(nn.Module):
@@ -72,12 +84,22 @@ class ViewColour(nn.Module):
     def forward(self, hidden: Tensor, directions: Tensor) -> Tensor:
         """hidden (R, N, width), directions (R, 3) -> rgb (R, N, 3) in [0, 1] up to the padding."""
         unit = directions / directions.norm(dim=-1, keepdim=True)
-        view = encode_directions(unit, self.degree)[:, None].expand(-1, hidden.shape[1], -1)
-        inputs = torch.cat([self.bottleneck(hidden), view], -1)
-        x = inputs
-        for layer in self.layers:
-            x = torch.relu(layer(x))
-        raw = self.rgb(torch.cat([x, inputs], -1) if self.skip else x)
+        view = encode_directions(unit, self.degree)
+        rows, middle = hidden.flatten(0, 1), self.bottleneck
+        if not self.skip:
+            # The directions are those of all intervals of a ray: their part of the layer is computed once a ray.
+            [first], width = self.layers, middle.out_features
+            weights = first.get_parameter("weight")
+            seen = torch.addmm(first.get_parameter("bias"), view, weights[:, width:].T)
+            layers = [Layer(middle.weight, middle.bias[None]), Layer(weights[:, :width], seen, True)]
+            [raw] = chain(rows, [*layers, Layer(self.rgb.weight, self.rgb.bias[None])], (False, False, True))
+        else:
+            inputs = torch.cat([middle(rows), view.repeat_interleave(hidden.shape[1], 0)], -1)
+            x = inputs
+            for layer in self.layers:
+                x = torch.relu(layer(x))
+            raw = self.rgb(torch.cat([x, inputs], -1))
+        raw = raw.view(*hidden.shape[:2], 3)
         return torch.sigmoid(raw) * (1.0 + 2.0 * self.padding) - self.padding
 
 

@@ -4,6 +4,7 @@ sec. 2)."""
 from __future__ import annotations
 
 import ctypes
+import functools
 import math
 
 import torch
@@ -69,6 +70,13 @@ def _turns(count: int, t: Tensor) -> Tensor:
     return torch.tensor(_TURNS[count], dtype=t.dtype, device=t.device) * (math.pi / 3)
 
 
+@functools.cache
+def _pattern(count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """What the kernel needs of an interval's samples, (count): spread along the ray, cosine and sine of the turn."""
+    steps, turns = torch.linspace(-1.0, 1.0, count), _turns(count, torch.zeros(()))
+    return steps * (math.sqrt(0.6) / steps.square().mean().sqrt()), turns.cos(), turns.sin()
+
+
 def _spirals(t: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
     """Whether (> 0.5) each interval's spiral is flipped, and its turn in radians, (R, N) both."""
     shape = t.shape[:-1] + (t.shape[-1] - 1,)
@@ -97,15 +105,10 @@ def grid_samples(
         kernels = library("zipnerf/cone_samples") if t.dtype == torch.float32 and t.device.type == "cpu" else None
         if kernels is None:
             return grid_samples_reference(rays, t, count, generator)
-        turns = _turns(count, t)
         flip, turn = _spirals(t, generator)
-        first, second = perpendicular_basis(rays.directions).unbind(-2)
-        steps = torch.linspace(-1.0, 1.0, count)
-        spread = steps * (math.sqrt(0.6) / steps.square().mean().sqrt())
         positions, std = t.new_empty((*flip.shape, count, 3)), t.new_empty((*flip.shape, count))
         inputs = [x.float().contiguous() for x in (
-            rays.origins, rays.directions, first, second, rays.radii, t, flip, turn.cos(), turn.sin(),
-            spread, turns.cos(), turns.sin(),
+            rays.origins, rays.directions, rays.radii, t, flip, turn.cos(), turn.sin(), *_pattern(count),
         )]  # fmt: skip
         kernels.cone_samples(
             *(pointer(x) for x in (*inputs, positions, std)),

@@ -36,13 +36,13 @@ def _corner(layout: GridLayout, level: int, cell: Tensor, bits: tuple[int, ...])
     return start + torch.where(inside, x + n * (y + n * z), 0), inside
 
 
-def query_reference(table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> tuple[Tensor, Tensor]:
+def query_reference(table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> Tensor:
     """The query in plain torch, differentiable in the table by autograd.
 
-    table (rows, F), positions (N, S, 3), std (N, S) -> features (N, L, F): mean over the S samples of weight times
-    trilinear interpolation between cell centres; weights (N, L): mean weight of each level.
+    table (rows, F), positions (N, S, 3), std (N, S) -> (N, L, F + 1), for each level F features, the mean over the S
+    samples of weight times trilinear interpolation between cell centres, and last the mean weight.
     """
-    features, weights = [], []
+    levels = []
     for level, n in enumerate(layout.resolutions):
         weight = level_weights(std, n)
         scaled = positions * n - 0.5
@@ -58,6 +58,5 @@ def query_reference(table: Tensor, positions: Tensor, std: Tensor, layout: GridL
             if inside is not None:
                 share = torch.where(inside, share, 0.0)
             value = value + share[..., None] * table[row]
-        features.append(value.mean(1))
-        weights.append(weight.mean(1))
-    return torch.stack(features, 1), torch.stack(weights, 1)
+        levels.append(torch.cat([value.mean(1), weight.mean(1)[:, None]], 1))
+    return torch.stack(levels, 1)

@@ -16,7 +16,7 @@ namespace {
 constexpr int B = 16;       // intervals per block
 constexpr int MAX_S = 6;    // samples per interval
 constexpr int P = B * MAX_S;
-constexpr int CHUNK = 128;  // blocks per chunk
+constexpr int CHUNK = 1024;  // blocks per chunk
 
 typedef float Reals __attribute__((vector_size(4 * B)));  // a number of each of a block's intervals
 typedef int32_t Integers __attribute__((vector_size(4 * B)));
@@ -243,8 +243,7 @@ struct Samples {
 };
 
 template <int F>
-void forward(const float* table, const Samples& in, float* features, float* weights, const Level* levels, int level_count,
-             int threads) {
+void forward(const float* table, const Samples& in, float* out, const Level* levels, int level_count, int threads) {
 #pragma omp parallel num_threads(threads)
     {
         std::unique_ptr<Block[]> blocks(new Block[CHUNK]);
@@ -263,9 +262,9 @@ void forward(const float* table, const Samples& in, float* features, float* weig
                     for (int s = 0; s < in.samples; ++s)
                         for (int i = 0; i < B; ++i) weight[i] += c.weight[s * B + i];
                     for (int i = 0; i < count; ++i) {
-                        const int64_t out = (first + i) * level_count + l;
-                        std::memcpy(features + out * F, sum + i * F, F * sizeof(float));
-                        weights[out] = weight[i];
+                        float* to = out + ((first + i) * level_count + l) * (F + 1);
+                        std::memcpy(to, sum + i * F, F * sizeof(float));
+                        to[F] = weight[i];
                     }
                 });
         }
@@ -291,8 +290,8 @@ void backward(const float* gradient, const Samples& in, float* table_gradient, c
                 if (owner(l) != mine) continue;
                 float* rows = table_gradient + levels[l].start * F;
                 in.each(chunk, blocks.get(), [&](const Block& b, int64_t first, int count) {
-                    const float* source = gradient + (first * level_count + l) * F;
-                    const int64_t stride = int64_t(level_count) * F;
+                    const float* source = gradient + (first * level_count + l) * (F + 1);
+                    const int64_t stride = int64_t(level_count) * (F + 1);
                     bool any = false;
                     for (int i = 0; i < count; ++i)
                         for (int f = 0; f < F; ++f) any |= source[i * stride + f] != 0.f;
@@ -309,8 +308,9 @@ void backward(const float* gradient, const Samples& in, float* table_gradient, c
 
 }  // namespace
 
-// levels: rows of (start, resolution, rows, hashed) as int64. Returns 0, or 1 where this build has no such F or S.
-extern "C" int hash_grid(int is_backward, const float* in, const float* positions, const float* std, float* out, float* weights,
+// Forward: in is the table, out (intervals, levels, features + 1) with each level's weight last. Backward: in is the
+// gradient of that, out the table's. levels: rows of (start, resolution, rows, hashed) as int64. Returns 0, or 1 where this build has no such F or S.
+extern "C" int hash_grid(int is_backward, const float* in, const float* positions, const float* std, float* out,
                          const int64_t* levels, int level_count, int features, int64_t intervals, int samples, int threads) {
     if (level_count > 32 || samples < 1 || samples > MAX_S) return 1;
     const Samples query{positions, std, intervals, samples};
@@ -320,7 +320,7 @@ extern "C" int hash_grid(int is_backward, const float* in, const float* position
 #define CASE(F)                                                                                                            \
     case F:                                                                                                                \
         if (is_backward) backward<F>(in, query, out, table, level_count, threads);                                         \
-        else forward<F>(in, query, out, weights, table, level_count, threads);                                             \
+        else forward<F>(in, query, out, table, level_count, threads);                                             \
         return 0;
     switch (features) {
         CASE(1) CASE(2) CASE(4) CASE(8)

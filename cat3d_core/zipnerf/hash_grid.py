@@ -10,7 +10,7 @@ from cat3d_core.zipnerf.grid_layout import GridLayout
 from cat3d_core.zipnerf.grid_reference import query_reference
 
 
-def query(table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> tuple[Tensor, Tensor]:
+def query(table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> Tensor:
     """`query_reference` by the fastest kernel there is for the tensors' device and dtype; gradient for the table only.
 
     float32 on the CPU: the C++ kernel where a compiler is found; float32 on CUDA: Triton where it is installed.

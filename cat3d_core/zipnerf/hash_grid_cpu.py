@@ -34,13 +34,12 @@ def _call(
     positions: Tensor,
     std: Tensor,
     out: Tensor,
-    weights: Tensor | None,
     layout: GridLayout,
 ) -> None:
     kernels = library("zipnerf/hash_grid")
     assert kernels is not None
     status = kernels.hash_grid(
-        ctypes.c_int(backward), pointer(source), pointer(positions), pointer(std), pointer(out), pointer(weights),
+        ctypes.c_int(backward), pointer(source), pointer(positions), pointer(std), pointer(out),
         _levels(layout), ctypes.c_int(layout.levels), ctypes.c_int(layout.features),
         ctypes.c_int64(std.shape[0]), ctypes.c_int(std.shape[1]), ctypes.c_int(torch.get_num_threads()),
     )  # fmt: skip
@@ -53,25 +52,23 @@ def _call(
 
 class _Query(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> Tensor:
         table, positions, std = table.contiguous(), positions.contiguous(), std.contiguous()
-        features = table.new_empty((std.shape[0], layout.levels, layout.features))
-        weights = table.new_empty((std.shape[0], layout.levels))
-        _call(False, table, positions, std, features, weights, layout)
+        out = table.new_empty((std.shape[0], layout.levels, layout.features + 1))
+        _call(False, table, positions, std, out, layout)
         ctx.save_for_backward(positions, std)
         ctx.layout = layout
-        ctx.mark_non_differentiable(weights)
-        return features, weights
+        return out
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor, _: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[override]
         positions, std = ctx.saved_tensors
         table_gradient = gradient.new_zeros((ctx.layout.rows, ctx.layout.features))
-        _call(True, gradient.contiguous(), positions, std, table_gradient, None, ctx.layout)
+        _call(True, gradient.contiguous(), positions, std, table_gradient, ctx.layout)
         return table_gradient, None, None, None
 
 
-def query(table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> tuple[Tensor, Tensor]:
+def query(table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> Tensor:
     """As `grid_reference.query_reference` for float32 CPU tensors; deterministic, gradient for the table only.
 
     Raises ValueError for shapes that do not fit the layout (the kernel itself checks nothing).

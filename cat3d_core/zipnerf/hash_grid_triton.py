@@ -154,7 +154,7 @@ def _table_gradient(gradient: Tensor, positions: Tensor, std: Tensor, layout: Gr
 
 class _Query(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> Tensor:
         table, positions, std = table.contiguous(), positions.contiguous(), std.contiguous()
         intervals, samples = std.shape
         features = table.new_empty((intervals, layout.levels, layout.features))
@@ -165,16 +165,15 @@ class _Query(torch.autograd.Function):
         )  # fmt: skip
         ctx.save_for_backward(positions, std)
         ctx.layout = layout
-        ctx.mark_non_differentiable(weights)
-        return features, weights
+        return torch.cat([features, weights[..., None]], -1)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor, _: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[override]
         positions, std = ctx.saved_tensors
-        return _table_gradient(gradient.contiguous(), positions, std, ctx.layout), None, None, None
+        return _table_gradient(gradient[..., :-1].contiguous(), positions, std, ctx.layout), None, None, None
 
 
-def query(table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> tuple[Tensor, Tensor]:
+def query(table: Tensor, positions: Tensor, std: Tensor, layout: GridLayout) -> Tensor:
     """As `hash_grid.query_reference` for float32 tensors on one GPU; gradient for the table only.
 
     Raises ValueError for shapes that do not fit the layout (the kernel checks nothing).

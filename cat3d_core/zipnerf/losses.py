@@ -7,7 +7,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from cat3d_core.zipnerf import stepfun
+from cat3d_core.zipnerf import ray_intervals
 from cat3d_core.zipnerf.config import ZipNerfConfig
 from cat3d_core.zipnerf.coordinates import power_ladder
 from cat3d_core.zipnerf.render import Round
@@ -33,25 +33,20 @@ def charbonnier(difference: Tensor, eps: float) -> Tensor:
 
 
 def interlevel(proposals: list[Round], final: Round, blur: tuple[float, ...]) -> Tensor:
-    """Spline inter-level loss (Zip-NeRF sec. 3): sum over proposals of mean(max(0, blurred w - proposal w)^2 /
-    proposal w).
-
-    The final histogram is a constant target; gradients flow to the proposals' weights only. eps keeps the denominator
-    from zero: the slope is below 1 / eps^2 = 7e13 for a missed surface, finite, and falls with the proposal's own
-    weight.
-    """
+    """Spline inter-level loss (Zip-NeRF sec. 3), summed over proposals (see `ray_intervals.interlevel_reference`). The
+    final histogram is a constant target; gradients flow to the proposals' weights only."""
     total = torch.zeros((), dtype=final.weights.dtype, device=final.weights.device)
     for proposal, halfwidth in zip(proposals, blur, strict=False):
-        target = stepfun.blurred_resample(proposal.s, final.s, final.weights.detach(), halfwidth)
-        eps = torch.finfo(target.dtype).eps
-        total = total + ((target - proposal.weights).clamp_min(0.0).square() / (proposal.weights + eps)).mean()
+        total = total + ray_intervals.interlevel(
+            proposal.s, proposal.weights, final.s, final.weights.detach(), halfwidth
+        )
     return total
 
 
 def distortion(final: Round, config: ZipNerfConfig) -> Tensor:
     """Mean distortion of the final histograms over power-ladder distance (Zip-NeRF supplement)."""
     t = power_ladder(final.t, config.distortion_power, config.distortion_premult)
-    return stepfun.distortion(t, final.weights).mean()
+    return ray_intervals.distortion(t, final.weights).mean()
 
 
 def inverse_depth(final: Round, target: Tensor, weight: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.rays import Rays, image_rays
 from cat3d_core.reconstruction.render import Render, normals_from_depth
 from cat3d_core.uncertainty import ray_entropy
-from cat3d_core.zipnerf import stepfun
+from cat3d_core.zipnerf import ray_intervals, stepfun
 from cat3d_core.zipnerf.config import ZipNerfConfig
 from cat3d_core.zipnerf.coordinates import t_from_s
 from cat3d_core.zipnerf.field import Field, GridDensity
@@ -56,13 +56,8 @@ def _lengths(t: Tensor, directions: Tensor) -> Tensor:
 
 
 def weights_from_density(density: Tensor, t: Tensor, directions: Tensor) -> Tensor:
-    """Compositing weights (R, n) = alpha * transmittance of intervals with edges t (R, n+1) along directions (R, 3).
-
-    alpha = -expm1(-optical depth): 1 - exp(-x) would lose thin fog (all of it at 1e-8) in float32.
-    """
-    depth = density * _lengths(t, directions)
-    before = torch.cat([torch.zeros_like(depth[..., :1]), depth[..., :-1].cumsum(-1)], -1)
-    return -torch.expm1(-depth) * torch.exp(-before)
+    """Compositing weights (R, n) = alpha * transmittance of intervals with edges t (R, n+1) along directions (R, 3)."""
+    return ray_intervals.weights(density, _lengths(t, directions))
 
 
 def _spread(values: Tensor, rows: Tensor | None, count: int) -> Tensor:
@@ -142,7 +137,7 @@ def render_rays(
     parts: list[Part] = []
     scale: Tensor | None = None
     for index, samples in enumerate(config.samples):
-        s = stepfun.sample_intervals(s, logits, samples, generator)
+        s = ray_intervals.sample_intervals(s, logits, samples, generator)
         t = t_from_s(s, config.near, config.far, config.distance_power, config.distance_premult)
         trained = torch.is_grad_enabled() and (train_proposals or index == config.rounds - 1)
         # A proposal that trains has to be seen whole: where it is 0, its loss would be unbounded.
@@ -154,7 +149,7 @@ def render_rays(
             if trained and config.near_gradient:
                 scale = near_gradient_scale(t, rays.directions)
                 density = scale_gradient(density, scale)
-            weights = weights_from_density(density, t, rays.directions)
+            weights = ray_intervals.weights(density, lengths)
         rounds.append(Round(s, t, weights))
         # The smallest normal number, not 0: a ray without any weight keeps finite logits.
         logits = anneal * weights.detach().clamp_min(torch.finfo(weights.dtype).tiny).log()

@@ -50,22 +50,26 @@ def sample_intervals(t: Tensor, logits: Tensor, count: int, generator: torch.Gen
     With a generator all samples of a row share one uniform jitter (stratified); without they sit at bin centres.
     Interval ends are the midpoints between samples, the first and last reflected.
     """
-    eps = torch.finfo(t.dtype).eps
-    if generator is None:
-        pad = 0.5 / count
-        u = torch.linspace(pad, 1.0 - pad - eps, count, dtype=t.dtype, device=t.device)
-        u = u.expand(*t.shape[:-1], count)
-    else:
-        last = eps + (1.0 - eps) / count  # u never reaches 1
-        jitter = torch.rand((*t.shape[:-1], 1), generator=generator, dtype=t.dtype, device=t.device)
-        step = (1.0 - last) / max(count - 1, 1)
-        u = torch.linspace(0.0, 1.0 - last, count, dtype=t.dtype, device=t.device) + jitter * max(step - eps, 0.0)
+    u = stratified(t, count, generator).expand(*t.shape[:-1], count)
     logits = torch.where(t[..., 1:] > t[..., :-1], logits, -torch.inf)
     centre = invert_cdf(u, t, logits)
     middle = 0.5 * (centre[..., 1:] + centre[..., :-1])
     first = (2.0 * centre[..., :1] - middle[..., :1]).clamp_min(0.0)
     final = (2.0 * centre[..., -1:] - middle[..., -1:]).clamp_max(1.0)
     return torch.cat([first, middle, final], -1)
+
+
+def stratified(t: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
+    """Numbers (..., count) in [0, 1), evenly apart, for the rows of t (..., n+1): moved by one jitter a row; without a
+    generator (count), at the middles of `count` bins."""
+    eps = torch.finfo(t.dtype).eps
+    if generator is None:
+        pad = 0.5 / count
+        return torch.linspace(pad, 1.0 - pad - eps, count, dtype=t.dtype, device=t.device)
+    last = eps + (1.0 - eps) / count  # u never reaches 1
+    jitter = torch.rand((*t.shape[:-1], 1), generator=generator, dtype=t.dtype, device=t.device)
+    step = (1.0 - last) / max(count - 1, 1)
+    return torch.linspace(0.0, 1.0 - last, count, dtype=t.dtype, device=t.device) + jitter * max(step - eps, 0.0)
 
 
 def blurred_resample(query: Tensor, t: Tensor, w: Tensor, halfwidth: float) -> Tensor:

@@ -27,7 +27,7 @@ from flows.bench.limits import Work
 from flows.progress import meter
 
 Times = tuple[float, float]  # wall and processor seconds
-Query = Callable[[Tensor, Tensor, Tensor, GridLayout], tuple[Tensor, Tensor]]
+Query = Callable[[Tensor, Tensor, Tensor, GridLayout], Tensor]
 
 #: What `curves` varies, one at a time, around a preset.
 VARIATIONS: dict[str, list[dict[str, Any]]] = {
@@ -205,7 +205,7 @@ def _workload(
         positions = (start + (end - start) * along).view(-1, 6, 3).to(device)
         std = (1e-4 + 1e-3 * along[..., 0]).expand(rays, -1, -1).reshape(-1, 6).to(device)
         table = torch.randn((layout.rows, features), generator=generator).to(device).requires_grad_()
-        gradient = torch.randn((rays * intervals, layout.levels, features), generator=generator).to(device)
+        gradient = torch.randn((rays * intervals, layout.levels, features + 1), generator=generator).to(device)
         best = _best_times(table, positions, std, layout, gradient, repeats, device)
         count = rays * intervals
         corners = count * 6 * 8 * layout.levels * features * 4
@@ -254,7 +254,7 @@ def _best_times(
             kept: list[Tensor] = []
 
             def forward(query: Query = query, kept: list[Tensor] = kept) -> None:
-                kept.append(query(table, positions, std, layout)[0])
+                kept.append(query(table, positions, std, layout))
 
             def backward(kept: list[Tensor] = kept) -> None:
                 kept.pop().backward(gradient)

@@ -21,7 +21,7 @@ from cat3d_core.metrics import psnr, ssim
 from cat3d_core.reconstruction import render as image_render
 from cat3d_core.splats import density, reference
 from cat3d_core.stress import ROUTINES, stress
-from cat3d_core.zipnerf import adam, coordinates, frustums, gradients, grid_reference, losses, render, stepfun
+from cat3d_core.zipnerf import adam, coordinates, frustums, gradients, grid_reference, losses, ray_intervals, stepfun
 from flows.commands.stress import QUICK_CASES, stress_command
 
 
@@ -49,7 +49,7 @@ def mutated(function: Callable[..., Any], changes: dict[str, str]) -> Iterator[N
 
 MUTATIONS: dict[str, tuple[Callable[..., Any], dict[str, str], str]] = {
     "thin fog lost by 1 - exp(-x)": (
-        render.weights_from_density,
+        ray_intervals.weights_reference,
         {"-torch.expm1(-depth)": "(1 - torch.exp(-depth))"},
         "render.weights_from_density",
     ),
@@ -143,7 +143,7 @@ MUTATIONS: dict[str, tuple[Callable[..., Any], dict[str, str], str]] = {
         "hash_grid.query_reference[dense]",
     ),
     "depth not clamped": (cameras.Cameras.project, {"depth.clamp(min=tiny)": "depth"}, "cameras.project"),
-    "usual eps in Adam": (adam.Adam.step, {"eps=self.eps": "eps=1e-8"}, "adam.Adam"),
+    "usual eps in Adam": (adam.Adam.step, {"eps = self.eps": "eps = 1e-8"}, "adam.Adam"),
     "amplitude by 1 - alpha^2": (
         schedule.alpha_sigma,
         {"torch.sigmoid(-log_snr).sqrt()": "(1 - torch.sigmoid(log_snr)).sqrt()"},

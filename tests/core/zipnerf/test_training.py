@@ -10,6 +10,7 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.rays import image_rays
 from cat3d_core.reconstruction import NonFiniteError, Views, draw_batch, normals_from_depth
 from cat3d_core.zipnerf import PRESETS, Field, Trainer, losses, render_image
+from cat3d_core.zipnerf import adam as adam_module
 from cat3d_core.zipnerf.adam import Adam
 from cat3d_core.zipnerf.field import encode_directions
 from cat3d_core.zipnerf.gradients import safe_exp
@@ -116,7 +117,10 @@ def test_generated_views_lose_weight_with_distance_and_time() -> None:
     assert end.tolist() == pytest.approx([1, 0.5 * math.exp(-0.15), 0.5 * math.exp(-15 * 0.25)], rel=1e-5)
 
 
-def test_adam_matches_torch_and_decays_untouched_entries() -> None:
+@pytest.mark.parametrize("kernel", [True, False])
+def test_adam_matches_torch_and_decays_untouched_entries(kernel: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not kernel:
+        monkeypatch.setattr(adam_module, "library", lambda name: None)
     generator = torch.Generator().manual_seed(0)
     start = torch.randn((64, 4), generator=generator) * 1e-3
     own, other = start.clone().requires_grad_(), start.double().requires_grad_()
@@ -128,10 +132,14 @@ def test_adam_matches_torch_and_decays_untouched_entries() -> None:
         own.grad = gradient.clone()
         decay = torch.cat([other[:16].detach() * 0.1 / 64, other[16:].detach() * 0.1 / 192])
         other.grad = gradient.double() + decay
-        adam.step(1e-3)
+        assert adam.step(1e-3)
         reference.step()
     torch.testing.assert_close(own.double(), other, rtol=0, atol=2e-6)
     assert own[32:].abs().mean() < start[32:].abs().mean()
+    before = {name: value.clone() for name, value in adam.state().items()}
+    own.grad = torch.full_like(own, 2e19)  # its square is no float32 number
+    assert not adam.step(1e-3)
+    assert all(torch.equal(value, before[name]) for name, value in adam.state().items())
 
 
 def test_direction_encoding() -> None:
