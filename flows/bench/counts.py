@@ -115,9 +115,13 @@ class FieldCount:
         self.flops += sum(linear(count, layer, backward).flops for layer in (grid.hidden, grid.density))
 
     def _colour(self, colour: Any, inputs: tuple[Tensor, Tensor], _out: Any) -> None:
-        count, backward = math.prod(inputs[0].shape[:-1]), torch.is_grad_enabled()
+        (rays, intervals), backward = inputs[0].shape[:2], torch.is_grad_enabled()
         for layer in (colour.bottleneck, *colour.layers, colour.rgb):
-            self.flops += linear(count, layer, backward).flops
+            self.flops += linear(rays * intervals, layer, backward).flops
+        if not colour.skip:  # the first layer's part for the direction is the same for all intervals of a ray
+            directions = 3 + 6 * colour.degree
+            each = 2.0 * directions * colour.layers[0].out_features * (3 if backward else 1)
+            self.flops -= each * rays * (intervals - 1)
 
     def steps(self, count: int) -> Work:
         """The work of one of so many steps of training: with Adam, which visits every parameter."""

@@ -76,17 +76,17 @@ def test_what_a_field_is_asked_is_counted() -> None:
     field = Field(config)
     rays, intervals, samples, width = 5, 7, config.multisamples, config.density_width
     positions, std = torch.rand(rays, intervals, samples, 3), torch.rand(rays, intervals, samples)
-    asked, grid = rays * intervals, field.grids[0]
+    asked, grid = rays * intervals, field.grids[-1]
     with counts.FieldCount(field) as count, torch.no_grad():
         _, hidden = grid(positions, std)
         field.colour(hidden, torch.rand(rays, 3))
     inputs = grid.layout.levels * (grid.layout.features + 1)
     layers = [(inputs, width), (width, 1), (width, config.bottleneck_width)]
-    seen = config.bottleneck_width + 3 + 6 * config.view_degree
-    layers += [(seen, config.view_width), (config.view_width, 3)]
+    layers += [(config.bottleneck_width, config.view_width), (config.view_width, 3)]
     assert config.view_depth == 1
     query = counts.grid_query(grid.layout, asked, samples).flops
-    assert count.flops == query + sum(2 * asked * a * b for a, b in layers)
+    directions = 2 * rays * (3 + 6 * config.view_degree) * config.view_width  # once a ray
+    assert count.flops == query + directions + sum(2 * asked * a * b for a, b in layers)
     assert count.intervals == asked
     with counts.FieldCount(field) as trained:
         grid(positions, std)
