@@ -23,6 +23,8 @@ from cat3d_core.reconstruction import Views, surface_depth
 from cat3d_core.synthetic import random_cameras, random_scene, trace
 from cat3d_core.synthetic.dataset import surface_points
 from cat3d_core.zipnerf import PRESETS, Field, Trainer, ZipNerfConfig, render_image
+from flows.bench import limits
+from flows.bench.counts import FieldCount
 from flows.bench.reconstruct import procedural_views
 from flows.errors import InputError
 from flows.exports.mesh import Mesh, fuse, without_crumbs
@@ -43,12 +45,15 @@ def measure(
         config = dataclasses.replace(config, iterations=iterations, warmup_iterations=iterations // 10)
     train, held, truth = procedural_views(family, views, test, size, size, seed)
     trainer = Trainer(config, train, seed, device)
-    started = time.perf_counter()
-    while not trainer.finished:
-        trainer.step()
+    with FieldCount(trainer.field) as count:
+        started = time.perf_counter()
+        while not trainer.finished:
+            trainer.step()
+        seconds = time.perf_counter() - started
     row: dict[str, Any] = {
         "family": family, "preset": preset, "iterations": trainer.iteration, "views": views, "size": size,
-        "train_s": time.perf_counter() - started, "device": device,
+        "train_s": seconds, "device": device,
+        **limits.columns(count.steps(trainer.iteration), seconds / trainer.iteration, device=device),
     }  # fmt: skip
     row |= depth_row(trainer.field, held, truth)
     started = time.perf_counter()

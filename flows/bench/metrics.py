@@ -6,6 +6,7 @@ Every row is measured in one run on the same images, round robin, so that a busy
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 from typing import Any
@@ -17,8 +18,13 @@ from torch import Tensor
 from cat3d_core.metrics.perceptual import find_perceptual
 from cat3d_core.metrics.psnr import psnr
 from cat3d_core.metrics.ssim import ssim
+from flows.bench import counts, limits
 
 Timed = Callable[[Tensor, Tensor], Tensor]
+#: Work of a metric for images of so many numbers, whoever computes it.
+WORK: dict[str, Callable[[int], limits.Work]] = {
+    "psnr": counts.psnr, "ssim gaussian": lambda n: counts.ssim(n, 11), "ssim uniform": lambda n: counts.ssim(n, 7),
+}  # fmt: skip
 
 
 def image_pairs(views: int, height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -85,10 +91,10 @@ def _implementations() -> dict[str, dict[str, Timed]]:
 
 def rows(views: int = 4, height: int = 378, width: int = 504, repeats: int = 5) -> list[dict[str, Any]]:
     """One row a metric and implementation: metric, implementation, views, height, width, threads, `seconds_per_view`
-    (best of `repeats`), `times_ours` (seconds / ours), `value` (mean over views) and `error` (largest difference from
-    the value of float64 images). A perceptual distance is timed as well where weights are found, on one 128x128 patch
-    (the paper's training patch), forward and, as "... gradient", with its gradient; it has no rival here (the packages
-    need torchvision).
+    (best of `repeats`), `times_ours` (seconds / ours), `value` (mean over views), `error` (largest difference from the
+    value of float64 images) and the shares of the machine's limits (`limits`). A perceptual distance is timed as well
+    where weights are found, on one 128x128 patch (the paper's training patch), forward and, as "... gradient", with its
+    gradient; it has no rival here (the packages need torchvision).
     """
     prediction, target = image_pairs(views, height, width)
     result = []
@@ -110,6 +116,7 @@ def rows(views: int = 4, height: int = 378, width: int = 504, repeats: int = 5) 
                     "times_ours": best[name] / best["cat3d"],
                     "value": float(values[name].mean()),
                     "error": float((values[name] - exact).abs().max()),
+                    **limits.columns(WORK[metric](target.numel()), best[name]),
                 }
             )
     size = {"views": views, "height": height, "width": width, "threads": torch.get_num_threads()}
@@ -132,11 +139,10 @@ def _perceptual_rows(prediction: Tensor, target: Tensor, repeats: int) -> list[d
         for _ in range(repeats):
             image = prediction.clone().requires_grad_(needs_gradient)
             start = time.perf_counter()
-            with torch.set_grad_enabled(needs_gradient):
-                loss = distance(image, target).sum()
-            if needs_gradient:
-                loss.backward()
+            _distance(distance, image, target, needs_gradient)
             best = min(best, time.perf_counter() - start)
+        flops = counts.counted(functools.partial(_distance, distance, image, target, needs_gradient))
+        work = limits.Work(flops, counts.network_bytes(distance) + 2 * counts.FLOAT * target.numel())
         result.append(
             {
                 "metric": name,
@@ -149,6 +155,14 @@ def _perceptual_rows(prediction: Tensor, target: Tensor, repeats: int) -> list[d
                 "height": height,
                 "width": width,
                 "threads": torch.get_num_threads(),
+                **limits.columns(work, best),
             }
         )
     return result
+
+
+def _distance(distance: Any, image: Tensor, target: Tensor, needs_gradient: bool) -> None:
+    with torch.set_grad_enabled(needs_gradient):
+        loss = distance(image, target).sum()
+    if needs_gradient:
+        loss.backward()

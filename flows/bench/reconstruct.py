@@ -6,6 +6,7 @@ Scenes are procedural (exact cameras and depth); every row says what was run and
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -15,11 +16,14 @@ import torch
 from torch import Tensor
 
 from cat3d_core.normalization import normalize_scene
-from cat3d_core.reconstruction import Views
+from cat3d_core.reconstruction import Render, Views
 from cat3d_core.synthetic import random_cameras, random_scene, trace
 from cat3d_core.zipnerf import PRESETS, Trainer, ZipNerfConfig, hash_grid_cpu, hash_grid_triton, render_image
 from cat3d_core.zipnerf.grid_layout import GridLayout, make_layout
 from cat3d_core.zipnerf.grid_reference import query_reference
+from flows.bench import limits
+from flows.bench.counts import FieldCount, grid_query
+from flows.bench.limits import Work
 from flows.progress import meter
 
 Times = tuple[float, float]  # wall and processor seconds
@@ -59,19 +63,28 @@ def procedural_views(
 
 def train_and_measure(
     config: ZipNerfConfig, train: Views, test: Views, depths: list[Tensor], device: str = "cpu", seed: int = 0
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """Train once: mean held-out PSNR (dB), absolute relative error of the median depth, wall and processor
-    seconds, training rays/s."""
+    seconds, training rays/s, and the shares of the machine's limits that a step and a rendered view reach (`limits`;
+    by processor time on a CPU)."""
     trainer = Trainer(config, train, seed, device)
 
     def train_all() -> None:
         while not trainer.finished:
             trainer.step()
 
-    seconds, cpu_seconds = _timed(train_all, device)
+    with FieldCount(trainer.field) as count:
+        seconds, cpu_seconds = _timed(train_all, device)
+    steps = trainer.iteration
+    training = _share(count.steps(steps), (seconds / steps, cpu_seconds / steps), device)
+    renders: list[Render] = []
+    with FieldCount(trainer.field) as count:
+        each = (render_image(trainer.field, test.cameras, index, config) for index in range(len(test)))
+        wall, cpu = _timed(lambda: renders.extend(each), device)
+    work = count.images(len(test), renders[0].depth.numel())
+    rendering = _share(work, (wall / len(test), cpu / len(test)), device)
     errors, relative = [], []
-    for index in range(len(test)):
-        out = render_image(trainer.field, test.cameras, index, config)
+    for index, out in enumerate(renders):
         truth = test.image(index).float() / 255
         errors.append(-10 * math.log10(float((out.image.cpu() - truth).square().mean())))
         seen = torch.isfinite(depths[index]) & (depths[index] > 0)
@@ -84,6 +97,8 @@ def train_and_measure(
         "iterations": float(trainer.iteration),
         "rays_per_s": trainer.iteration * config.batch_rays / seconds,
         "skipped": float(trainer.skipped),
+        **training,
+        "render_share_of_limit": rendering["share_of_limit"],
     }
 
 
@@ -155,7 +170,8 @@ def kernels(
     against the torch reference; `cpu_ratio` by processor time, which other jobs on the machine lengthen less. The rows
     of all grids sum up a step. `floor_share` is the least time memory needs
     (positions and std read, features and weights written, 8 corners of each sample and level gathered once; backward
-    scatters them) over the time taken; a share above 1 means that the corners came from the cache.
+    scatters them) over the time taken; a share above 1 means that the corners came from the cache. `share_of_limit` and
+    its neighbours are those of `limits`, by processor time on a CPU.
     """
     before, rows = torch.get_num_threads(), []
     try:
@@ -179,6 +195,7 @@ def _workload(
     log2_table = log2_table or config.grid_log2_table
     rows: list[dict[str, Any]] = []
     total: dict[tuple[str, str], Times] = {}
+    asked: dict[str, Work] = {"forward": Work(), "backward": Work()}
     for max_resolution, features, intervals in zip(config.grid_max, config.grid_features, config.samples, strict=True):
         layout = make_layout(config.grid_base, max_resolution, log2_table, features)
         # Samples along rays through the cube, their spread that of a pixel of a 512-pixel image.
@@ -194,17 +211,25 @@ def _workload(
         corners = count * 6 * 8 * layout.levels * features * 4
         moved = count * (6 * 16 + layout.levels * (features + 1) * 4)
         grid = f"2^{log2_table} to {max_resolution}, F={features}"
+        work = {phase: grid_query(layout, count, 6, phase) for phase in asked}
+        asked = {phase: asked[phase] + work[phase] for phase in asked}
         for (name, phase), times in best.items():
             total[name, phase] = _sum([total.get((name, phase), (0.0, 0.0)), times])
             floor = (moved + corners * (1 if phase == "forward" else 2)) / bandwidth
             rows.append(_kernel_row(grid, phase, name, rays, times, best["torch reference", phase])
-                        | {"intervals_per_ray": intervals, "floor_share": floor / times[0]})  # fmt: skip
+                        | {"intervals_per_ray": intervals, "floor_share": floor / times[0]}
+                        | _share(work[phase], times, device))  # fmt: skip
     for name in _kernels(device):
         for phase in ("forward", "backward", "both"):
             phases = ("forward", "backward") if phase == "both" else (phase,)
             times, reference = (_sum([total[k, p] for p in phases]) for k in (name, "torch reference"))
-            rows.append(_kernel_row("all", phase, name, rays, times, reference))
+            work_all = functools.reduce(Work.__add__, (asked[p] for p in phases))
+            rows.append(_kernel_row("all", phase, name, rays, times, reference) | _share(work_all, times, device))
     return rows
+
+
+def _share(work: Work, times: Times, device: str) -> dict[str, Any]:
+    return limits.columns(work, times[device == "cpu"], "cpu" if device == "cpu" else "wall", device=device)
 
 
 def _sum(times: Sequence[Times]) -> Times:

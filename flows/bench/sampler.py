@@ -23,6 +23,8 @@ from cat3d_core.diffusion.sampler import evaluations
 from cat3d_core.diffusion.schedule import Nodes, alpha_sigma
 from cat3d_core.diffusion.solvers import SOLVERS
 from cat3d_core.random import generator
+from flows.bench import limits
+from flows.bench.counts import counted, network_bytes
 
 # Log-SNR intervals of guidance: everywhere, without the cleanest part, and without the noisiest part too.
 INTERVALS = {"all": (-math.inf, math.inf), "below 2": (-math.inf, 2.0), "middle": (-5.0, 2.0)}
@@ -112,7 +114,8 @@ def rows(
     """One row per problem, solver, nodes, steps, guidance interval and dtype: `evaluations` a group, `seconds` a group,
     `error` (median over groups of the RMS difference from the reference with the same interval), `error_p90`,
     `error_guided_p90` (of the difference from the reference that is guided everywhere), and `interval_change` (how far
-    the reference itself moves when guidance is limited to the interval). model_path: measure this model instead."""
+    the reference itself moves when guidance is limited to the interval), and shares of the machine's limits (`limits`;
+    of the network's evaluations alone). model_path: measure this model instead."""
     name, problem = ("mixture", mixture_problem(groups or 64))
     if model_path is not None:
         name, problem = "model", model_problem(model_path, groups or 2)
@@ -126,6 +129,8 @@ def rows(
     result = []
     for dtype_name, dtype in DTYPES.items():
         model.unet.to(dtype)
+        one = evaluation_work(problem, dtype)
+        format_ = torch.float64 if name == "mixture" else dtype  # the closed form is computed in float64
         for interval, (low, high) in INTERVALS.items():
             guidance = GuidanceConfig(3.0, low, high)
             for solver in SOLVERS:
@@ -135,8 +140,19 @@ def rows(
                         row = {"problem": name, "solver": solver, "nodes": nodes, "steps": count, "interval": interval}
                         change = (references[interval] - references["all"]).square().mean().sqrt()
                         measured = _measure(problem, config, references[interval], references["all"])
+                        measured |= limits.columns(one * measured["evaluations"], measured["seconds"], dtype=format_)
                         result.append(row | {"dtype": dtype_name, "interval_change": float(change)} | measured)
     return result
+
+
+def evaluation_work(problem: Problem, dtype: torch.dtype) -> limits.Work:
+    """One group's share of a step with one evaluation of the network, which is in `dtype`: the operations; the weights,
+    read once for all groups, and latents in and out."""
+    model, latents, cameras, noise = problem
+    config, groups = SamplerConfig("ddim", steps=1, guidance=GuidanceConfig(1.0)), len(noise)
+    flops = counted(lambda: sample(model, latents, cameras, noise, config))
+    moved = network_bytes(model.unet) + 2 * (latents.numel() + noise.numel()) * dtype.itemsize
+    return limits.Work(flops / groups, moved / groups)
 
 
 def _measure(problem: Problem, config: SamplerConfig, reference: Tensor, guided: Tensor) -> dict[str, float]:

@@ -2,9 +2,11 @@
 
 `python -m flows.bench.sampling WORK [--model FILE] [--groups 24]` prints what
 `docs/explanation/scaling.md` calculates with.
-  share    wall time, workers' busy seconds, overhead = workers * wall / busy - 1, of sampling real groups, by executor
+  share    wall time, workers' busy seconds, overhead = workers * wall / busy - 1, of sampling real groups, by executor;
+           share_of_limit of the network's operations in the busy seconds (`limits`)
   batch    seconds a batch costs apart from its groups: handed groups that are done already, a worker only looks
-  store    operations per second on the store: latents written, marks written, marks read
+  store    operations per second on the store: latents written, marks written, marks read; share_of_limit of the bytes
+           of latents as one large file
 """
 
 from __future__ import annotations
@@ -17,12 +19,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
+from flows.bench import limits
+from flows.generation.groups import StoredPlan
 from flows.jobs.job import Job
 from flows.jobs.request import Request, make_config
 from flows.pipeline.runner import opened, run_missing
 from flows.pipeline.server import prefect_server
-from flows.stages.sample import sample_work
+from flows.stages.sample import sample_work, sampling_flops
 from flows.workers.executors import open_executor
 from flows.workers.fan_out import fan_out
 from flows.workers.work import is_done
@@ -60,8 +65,21 @@ def share_row(job: Job, executor: str, workers: int) -> dict[str, Any]:
     return {
         "what": "share", "executor": executor, "workers": workers, "groups": len(work.views), "wall_s": wall,
         "busy_s": totals.busy_seconds, "loading_s": totals.loading_seconds, "batches": totals.batches,
-        "overhead": workers * wall / totals.busy_seconds - 1,
+        "overhead": workers * wall / totals.busy_seconds - 1, **network_share(job, store, totals.busy_seconds),
     }  # fmt: skip
+
+
+def network_share(job: Job, store: SceneStore, seconds: float) -> dict[str, Any]:
+    """Of sampling all groups, on the threads of a worker: the limit is measured here and now, without other workers."""
+    flops, threads = (
+        sampling_flops(job, StoredPlan(store, store.run(job.run), job.config.seed)),
+        torch.get_num_threads(),
+    )
+    torch.set_num_threads(job.config.execution.threads)
+    try:
+        return limits.columns(limits.Work(flops), seconds)
+    finally:
+        torch.set_num_threads(threads)
 
 
 def batch_row(job: Job, executor: str, count: int = 40) -> dict[str, Any]:
@@ -110,7 +128,11 @@ def store_rows(job: Job, folder: Path, views: int = 400) -> Iterator[dict[str, A
         for view in range(views):
             operation(view)
         wall, cpu = time.monotonic() - started, time.process_time() - started_cpu
-        yield {"what": "store", "operation": name, "wall_ms": 1000 * wall / views, "cpu_ms": 1000 * cpu / views}
+        row = {"what": "store", "operation": name, "wall_ms": 1000 * wall / views, "cpu_ms": 1000 * cpu / views}
+        if name.startswith("latent"):
+            written, read = (latent.nbytes * (name == f"latent {what}") for what in ("written", "read"))
+            row |= limits.file_columns(written, read, wall / views, folder)
+        yield row
 
 
 def main() -> None:

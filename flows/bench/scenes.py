@@ -13,6 +13,8 @@ from cat3d_core.metrics.protocols import evaluate
 from cat3d_core.normalization import normalize_scene
 from cat3d_core.reconstruction import Views
 from cat3d_core.zipnerf import Trainer, ZipNerfConfig, render_image
+from flows.bench import limits
+from flows.bench.counts import FieldCount
 from flows.errors import InputError
 from flows.readers import read_capture
 from flows.stages.ingest import ingest_view
@@ -49,13 +51,16 @@ def scene_views(folder: Path, split: str, downscale: int) -> tuple[Views, Views]
 
 
 def row(folder: Path, split: str, config: ZipNerfConfig, downscale: int, seed: int = 0) -> dict[str, Any]:
-    """Train once: mean PSNR (dB) and SSIM over the held-out views, seconds of training and of a rendered view."""
+    """Train once: mean PSNR (dB) and SSIM over the held-out views, seconds of training and of a rendered view, and the
+    share of the machine's limits that a step of training reaches, by processor time (`limits`)."""
     train, held = scene_views(folder, split, downscale)
     trainer = Trainer(config, train, seed)
     started, cpu = time.perf_counter(), time.process_time()
-    while not trainer.finished:
-        trainer.step()
+    with FieldCount(trainer.field) as count:
+        while not trainer.finished:
+            trainer.step()
     seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu
+    share = limits.columns(count.steps(trainer.iteration), cpu_seconds / trainer.iteration, "cpu")
     started, found = time.perf_counter(), []
     for index in range(len(held)):
         image = render_image(trainer.field, held.cameras, index).image
@@ -67,5 +72,5 @@ def row(folder: Path, split: str, config: ZipNerfConfig, downscale: int, seed: i
         "psnr_db": sum(view["psnr"] for view in found) / len(found),
         "ssim": sum(view["ssim"] for view in found) / len(found),
         "train_s": seconds, "train_cpu_s": cpu_seconds,
-        "render_s_per_view": (time.perf_counter() - started) / len(held),
+        "render_s_per_view": (time.perf_counter() - started) / len(held), **share,
     }  # fmt: skip

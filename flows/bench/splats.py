@@ -20,6 +20,7 @@ from cat3d_core.reconstruction import ReconstructionRequest, Reconstructor, Rend
 from cat3d_core.splats import Gaussians, rasterize_cpu, reference, render
 from cat3d_core.splats.viewpoints import between
 from cat3d_core.synthetic.families import FAMILIES
+from flows.bench import counts, limits
 from flows.bench.reconstruct import procedural_views
 from flows.bench.scenes import DOWNSCALE, scene_views
 from flows.exports.splats import splats_of, write_splats
@@ -34,7 +35,8 @@ REFERENCE_PAIRS = 20_000_000
 
 
 def kernel_rows(repeats: int = 3, threads: Sequence[int] = (1, 2)) -> list[dict[str, Any]]:
-    """Seconds of a step's forward and backward pass, by processor time, the best of `repeats`."""
+    """Seconds of a step's forward and backward pass, by processor time, the best of `repeats`, and the share
+    of the machine's limits that the two together reach (`limits`)."""
     rows = []
     before = torch.get_num_threads()
     try:
@@ -44,9 +46,11 @@ def kernel_rows(repeats: int = 3, threads: Sequence[int] = (1, 2)) -> list[dict[
                 found = {"C++ kernel": _pass(rasterize_cpu.rasterize, count, side, repeats)}
                 if count * side * side <= REFERENCE_PAIRS:
                     found["torch reference"] = _pass(reference.rasterize, count, side, 1)
+                work = _work(count, side)
                 for name, (forward, backward) in found.items():
                     row = {"rasteriser": name, "gaussians": count, "side": side, "threads": number}
                     row |= {"forward_ms": forward * 1e3, "backward_ms": backward * 1e3}
+                    row |= limits.columns(work, forward + backward, "cpu")
                     if "torch reference" in found:
                         row["ratio"] = sum(found["torch reference"]) / (forward + backward)
                     rows.append(row)
@@ -55,7 +59,7 @@ def kernel_rows(repeats: int = 3, threads: Sequence[int] = (1, 2)) -> list[dict[
     return rows
 
 
-def _pass(draw: Any, count: int, side: int, repeats: int) -> tuple[float, float]:
+def _inputs(count: int, side: int) -> tuple[list[Tensor], Cameras]:
     generator = torch.Generator().manual_seed(0)
     # As many pixels wide that each pixel is covered some ten times.
     width = 1.5 * (1.0 / count) ** 0.5
@@ -64,11 +68,20 @@ def _pass(draw: Any, count: int, side: int, repeats: int) -> tuple[float, float]
         width * torch.exp(torch.randn((count, 3), generator=generator) * 0.5), torch.rand(count, generator=generator),
         torch.rand((count, 3), generator=generator),
     ]  # fmt: skip
-    inputs = [value.requires_grad_() for value in inputs]
     pose = torch.eye(4)[None].clone()
     pose[0, 2, 3] = -2.0
     k = torch.tensor([[[float(side), 0, side / 2], [0, float(side), side / 2], [0, 0, 1]]])
-    camera = Cameras(k, pose, torch.tensor([[side, side]]))
+    return inputs, Cameras(k, pose, torch.tensor([[side, side]]))
+
+
+def _work(count: int, side: int) -> limits.Work:
+    inputs, camera = _inputs(count, side)
+    return counts.rasterization(inputs, camera) + counts.rasterization(inputs, camera, "backward")
+
+
+def _pass(draw: Any, count: int, side: int, repeats: int) -> tuple[float, float]:
+    inputs, camera = _inputs(count, side)
+    inputs = [value.requires_grad_() for value in inputs]
     best = [float("inf")] * 2
     for _ in range(repeats):
         started = time.process_time()

@@ -24,6 +24,7 @@ from cat3d_core.diffusion import load_model
 from cat3d_core.random import normal
 from cat3d_core.synthetic import random_cameras, random_scene, trace
 from cat3d_core.weights import default_model_path
+from flows.bench import limits
 from schemas import arrays
 
 #: Name -> compressor in front of crc32c; None stores the bytes as they are.
@@ -97,7 +98,8 @@ def rows(views: int = 8, size: int = 512, repeats: int = 5) -> list[dict[str, An
     """One row per content (image, latent), format and codec: `bytes_per_view` on disk, `ratio` (to the bytes in that
     format without compression), `write_mb_s` and `read_mb_s` (1e6 bytes before compression per CPU second, best of
     `repeats`, the codecs taking turns), `cpu_ms_per_view` (written and read once), `error` (root mean
-    square, in units of [0, 1] for images and of the latents' standard deviation), `store_format`, `store_codec`,
+    square, in units of [0, 1] for images and of the latents' standard deviation), `share_of_limit` (what the bytes on
+    disk take as one large file, written and read, over what they took: `limits`), `store_format`, `store_codec`,
     `default`: whether the store uses the format, the codec, and both for this content."""
     images, latents, source = views_and_latents(views, size)
     found = _content_rows("image", images, "procedural", repeats)
@@ -177,6 +179,9 @@ def _measure(stored: NDArray[Any], repeats: int) -> dict[str, dict[str, float]]:
             "write_mb_s": stored.nbytes / 1e6 / write[codec],
             "read_mb_s": stored.nbytes / 1e6 / read[codec],
             "cpu_ms_per_view": 1e3 * (write[codec] + read[codec]) / len(stored),
+            **limits.file_columns(
+                size[codec], size[codec], write[codec] + read[codec], Path(tempfile.gettempdir()), "cpu"
+            ),
         }
         for codec in CODECS
     }

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import Any
 
 import torch
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.synthetic import FAMILIES, Scene, random_cameras, random_scene, render_views
+from flows.bench import limits
+from flows.bench.counts import FLOAT, counted
 
 
 def rows(size: int = 128, views: int = 8, repeats: int = 3) -> list[dict[str, Any]]:
     """Best of `repeats`: seconds and views a second for `size` x `size` images at 2 x 2 rays a pixel; 1 scene at a time
-    on the CPU, 16 on a GPU (scenes are batched there, to fill it)."""
+    on the CPU, 16 on a GPU (scenes are batched there, to fill it). Shares of the machine's limits (`limits`) are of
+    what torch is asked for, and of the images alone."""
     out = []
     for device in ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]:
         scenes = 1 if device == "cpu" else 16
@@ -29,9 +33,12 @@ def rows(size: int = 128, views: int = 8, repeats: int = 3) -> list[dict[str, An
                     torch.cuda.synchronize()
                 best = min(best, time.perf_counter() - start)
             count = scenes * views
+            flops = counted(partial(render_views, scene, cameras))
+            work = limits.Work(flops, float(3 * FLOAT * count * size * size))
             out.append(
                 {"benchmark": "render", "family": family, "device": device, "size": size, "scenes": scenes,
-                 "threads": torch.get_num_threads(), "time_s": round(best, 4), "views_per_s": round(count / best, 1)}
+                 "threads": torch.get_num_threads(), "time_s": round(best, 4), "views_per_s": round(count / best, 1),
+                 **limits.columns(work, best, device=device)}
             )  # fmt: skip
     return out
 

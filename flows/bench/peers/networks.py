@@ -1,7 +1,7 @@
 """diffusers' U-Net beside ours, both of the shipped model's size, in one process of the peers' environment.
 
 They are not one network (ours attends over all views of a group), so each is held against its own arithmetic:
-`gflops_per_s`, and its share of what a large matrix product reaches on the same threads.
+`gflop_per_s`, and its share of what a large matrix product reaches on the same threads (`flows/bench/limits.py`).
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch.utils.flop_counter import FlopCounterMode
 
 from cat3d_core.diffusion import load_model
 from cat3d_core.weights import default_model_path
+from flows.bench import limits
+from flows.bench.counts import counted, network_bytes
 from flows.bench.peers.torchvision_cpu import allow_torchvision
 
 
@@ -45,18 +46,14 @@ def measure(task: Task) -> list[Row]:
         "cat3d": (model.unet, lambda: model.unet(latents, steps, cameras, mask)),
         "diffusers": (theirs, lambda: theirs(flat, 500).sample),
     }
-    square = torch.randn(2048, 2048)
-    most = 2 * 2048**3 / _best(lambda: square @ square, 5)
     rows = []
     with torch.no_grad():
         for who, (network, run) in runs.items():
-            with FlopCounterMode(display=False) as counter:
-                run()
-            seconds, flops = _best(run, repeats), counter.get_total_flops()
+            work = limits.Work(counted(run), network_bytes(network) + 2 * flat.numel() * flat.element_size())
+            seconds = _best(run, repeats)
             rows.append(
                 {"who": who, "setting": f"{sum(p.numel() for p in network.parameters()) / 1e6:.1f} M parameters",
-                 "seconds": seconds / (groups * views), "gflops_per_s": flops / seconds / 1e9,
-                 "share_of_limit": flops / seconds / most}
+                 "seconds": seconds / (groups * views), **limits.columns(work, seconds)}
             )  # fmt: skip
     return rows
 

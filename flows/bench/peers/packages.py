@@ -16,9 +16,11 @@ def measure(task: Task) -> list[Row]:
     allow_torchvision()
     torch.set_num_threads(task.settings["threads"])
     sizes = {name: task.settings[name] for name in ("views", "height", "width", "repeats")}
+    shares = ("gflop_per_s", "gb_per_s", "share_of_limit", "bound_by")
     return [
         {"who": row["implementation"], "setting": row["metric"], "seconds": row["seconds_per_view"],
-         "error": row.get("error"), "times_ours": row.get("times_ours")}
+         "error": row.get("error"), "times_ours": row.get("times_ours"),
+         **{name: row[name] for name in shares if name in row}}
         for row in rows(**sizes)
     ]  # fmt: skip
 

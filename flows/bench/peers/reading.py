@@ -1,4 +1,7 @@
-"""The pictures of a store through ours, zarr itself and xarray, in one process: every view once, one after another."""
+"""The pictures of a store through ours, zarr itself and xarray, in one process: every view once, one after another.
+
+`share_of_limit`: what their bytes on disk take as one large file beside the store, over the time it took.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,7 @@ import numpy as np
 import xarray
 import zarr
 
+from flows.bench import limits
 from schemas.scene_store import SceneStore
 
 ARRAY = "image"
@@ -37,13 +41,15 @@ def measure(task: Task) -> list[Row]:
 
     readers: dict[str, Callable[[], Iterator[Any]]] = {"cat3d": ours, "zarr": plain, "xarray": labelled}
     expected, rows = list(ours()), []
+    stored = sum(f.stat().st_size for f in (path / "captured" / ARRAY).rglob("c.*"))
     for who, read in readers.items():
         seconds = min(_seconds(read) for _ in range(task.settings["repeats"]))
         wrong = max(float(np.abs(a.astype(int) - b).max()) for a, b in zip(expected, read(), strict=True))
         megabytes = sum(image.nbytes for image in expected) / 1e6
         rows.append(
             {"who": who, "setting": f"{len(expected)} views", "seconds": seconds / len(expected),
-             "mb_per_s": megabytes / seconds, "error": wrong}
+             "mb_per_s": megabytes / seconds, "error": wrong,
+             **limits.file_columns(0, stored, seconds, path.parent)}
         )  # fmt: skip
     return rows
 

@@ -13,6 +13,8 @@ import torch
 from cat3d_core.cameras import Cameras
 from cat3d_core.reconstruction import Views
 from cat3d_core.zipnerf import PRESETS, Trainer, render_image
+from flows.bench import limits
+from flows.bench.counts import FieldCount
 
 
 def measure(task: Task) -> list[Row]:
@@ -33,11 +35,14 @@ def measure(task: Task) -> list[Row]:
     def render(index: int) -> np.ndarray:
         return render_image(trainer.field, test.cameras, index, config).image.numpy()
 
+    count = FieldCount(trainer.field)
     while not trainer.finished:
-        curve.train(trainer.step)
+        with count:
+            curve.train(trainer.step)
         done = trainer.iteration
         if trainer.finished or (done >= 32 and done & (done - 1) == 0):
-            curve.point(done, render, rays_per_s=done * config.batch_rays / curve.seconds)
+            share = limits.columns(count.steps(done), curve.cpu_seconds / done, "cpu")
+            curve.point(done, render, rays_per_s=done * config.batch_rays / curve.seconds, **share)
     return curve.rows
 
 

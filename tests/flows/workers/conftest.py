@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
 from flows.jobs.job import Job
 from tests.flows.workers.scene import make_job, prepare, random_model, run_of, run_stages
+
+if TYPE_CHECKING:
+    from tests.flows.workers.dask_faults import Calls
 
 
 @pytest.fixture(scope="session")
@@ -52,3 +55,23 @@ def expected(prepared: Path, checkpoint: Path, tmp_path_factory: pytest.TempPath
         run_stages(job, "sample")
         result[split] = run_of(job).generated.read("latent")
     return result
+
+
+@pytest.fixture(scope="module")
+def address(prefect_url: str) -> Iterator[str]:
+    """The scheduler of two Dask workers in this process."""
+    import distributed
+
+    from tests.flows.workers.dask_faults import HERE
+
+    with distributed.LocalCluster(n_workers=2, **HERE) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture
+def calls() -> Iterator[Calls]:
+    """Calls of ours to Dask, counted."""
+    from tests.flows.workers.dask_faults import Calls
+
+    with Calls().watched() as found:
+        yield found
