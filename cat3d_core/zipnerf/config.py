@@ -163,8 +163,8 @@ _PAPER = ZipNerfConfig()
 
 # For two CPU cores and small images: a scene in seconds (tiny), about half a minute (fast), or over ten minutes
 # (balanced). One proposal round did as well as two at equal cost on fox (27.3 against 26.6 dB) and fern at 3 views
-# (25.4 against 24.9). Half the samples cost 1.2 dB. Three multisamples instead of six cost nothing, and with small batches a
-# learning rate that ends higher gains 0.3 dB: so 800 steps do what 1,000 did (docs/log/2026-11-29_speed.md).
+# (25.4 against 24.9). Half the samples cost 1.2 dB. Three multisamples instead of six cost nothing, and with small
+# batches a learning rate that ends higher gains 0.3 dB: so 800 steps do what 1,000 did (docs/log/2026-11-29_speed.md).
 _FAST = replace(
     _PAPER,
     iterations=800,

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 from collections.abc import Iterator
 
 import torch
 
 from flows.errors import InputError
 from schemas.execution import ExecutionConfig
+
+#: What `cpu_threads` has set: number of the block -> threads; 0: what was before the first block.
+_COUNTS: dict[int, int] = {}
+_LOCK = threading.Lock()
 
 
 def device() -> str:
@@ -92,10 +97,21 @@ def free_device_memory() -> None:
 
 @contextlib.contextmanager
 def cpu_threads(count: int) -> Iterator[None]:
-    """PyTorch with this many CPU threads: the same number in every process, as it may decide how sums are split."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
+    """PyTorch with this many CPU threads: the same number in every process, as it may decide how sums are split.
+
+    The number is the whole process's. Blocks may lie in each other or, where a Dask worker has several threads, end in
+    any order: the youngest one left decides, and after the last there is what was before the first."""
+    with _LOCK:
+        if not _COUNTS:
+            _COUNTS[0] = torch.get_num_threads()
+        mine = max(_COUNTS) + 1
+        _COUNTS[mine] = count
+        torch.set_num_threads(count)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        with _LOCK:
+            del _COUNTS[mine]
+            torch.set_num_threads(_COUNTS[max(_COUNTS)])
+            if len(_COUNTS) == 1:
+                _COUNTS.clear()
