@@ -21,7 +21,8 @@ from infra.mutants.swap import CORE, function_name
 
 @dataclass(frozen=True)
 class Entered:
-    """One test: its seconds with set-up, `FILE:FUNCTION` of what it enters, and whether it holds on the sound code."""
+    """One test: its seconds of computing with set-up, `FILE:FUNCTION` of what it enters, whether it holds on the sound
+    code."""
 
     seconds: float
     functions: frozenset[str]
@@ -55,16 +56,17 @@ def measure(items: list[pytest.Item], path: Path, fork: Callable[..., list[dict[
     def work(say: Callable[[dict[str, Any]], None]) -> None:
         with path.open("a") as file:
             for item in new:
-                say({"test": item.nodeid, "within": 600.0})
-                started = time.monotonic()
+                say({"test": item.nodeid})
+                started = time.process_time()
                 tracer = _Tracer()
                 sys.settrace(tracer)
                 threading.settrace(tracer)
                 # As if it were the last: fixtures that tests share are made for each, and are part of what it enters.
                 reports = runtestprotocol(item, log=False, nextitem=None)
                 sys.settrace(None)
+                seconds = time.process_time() - started
                 row = {
-                    "test": item.nodeid, "digest": digests[item.path], "seconds": round(time.monotonic() - started, 3),
+                    "test": item.nodeid, "digest": digests[item.path], "seconds": round(seconds, 3),
                     "holds": not any(report.failed for report in reports),
                     "functions": sorted({":".join(function_name(code)) for code in tracer.seen}),
                 }  # fmt: skip

@@ -79,7 +79,7 @@ def marked_string(node: cst.SimpleString) -> Iterable[cst.BaseString]:
         yield from list(mutators.operator_string(node))[:1]
 
 
-OPERATORS: tuple[tuple[type, Any], ...] = (
+OPERATORS: tuple[tuple[Any, Any], ...] = (
     (cst.BaseNumber, mutators.operator_number),
     (cst.SimpleString, marked_string),
     (cst.Name, mutators.operator_name),
@@ -91,7 +91,7 @@ OPERATORS: tuple[tuple[type, Any], ...] = (
     (cst.CSTNode, mutators.operator_keywords),
     (cst.CSTNode, mutators.operator_swap_op),
     (cst.IfExp, mutators.operator_if_exp),
-    ((cst.If, cst.While), negated),  # type: ignore[arg-type]
+    ((cst.If, cst.While), negated),
     (cst.Expr, dropped),
 )
 _SILENT = m.Raise() | m.Assert() | m.Annotation() | m.Decorator() | m.FormattedString() | m.Parameters()

@@ -35,15 +35,15 @@ TESTS = ("tests/core", "tests/stress")
 #: The tests of faults and of the search itself say nothing of other functions.
 NOT_THESE = ("tests/stress/test_mutations.py",)
 TOO_LONG_S = 20.0  # tests that take longer alone are left out
-TOGETHER_S = 40.0  # no more seconds of tests, as measured, for one mutant
-PATIENCE_S, PATIENCE = 10.0, 4.0  # a test may take this long, plus so many times what it took before
+PATIENCE_S, PATIENCE = 5.0, 4.0  # seconds of computing that a test may take, plus so many times what it took before
+ASLEEP_S = 300.0  # on the clock, for a test that waits for something
 
 
 class Runner:
     """The pytest plugin that does it all in place of the usual loop over tests."""
 
-    def __init__(self, mutants: list[dict[str, Any]], results: Path, minutes: float) -> None:
-        self.mutants, self.results, self.minutes = mutants, results, minutes
+    def __init__(self, mutants: list[dict[str, Any]], results: Path, minutes: float, together: float) -> None:
+        self.mutants, self.results, self.minutes, self.together = mutants, results, minutes, together
 
     def pytest_sessionstart(self) -> None:
         import hypothesis
@@ -72,7 +72,7 @@ class Runner:
                 if time.monotonic() > until:
                     print(f"\nStopped after {self.minutes:g} minutes with {len(self.mutants) - number} to go.")
                     break
-                tests = [(items[name], seconds) for name, seconds in tests_for(mutant, entered)]
+                tests = [(items[name], seconds) for name, seconds in tests_for(mutant, entered, self.together)]
                 row = {**mutant, **judge(mutant, tests, living)}
                 file.write(json.dumps(row) + "\n")
                 file.flush()
@@ -80,15 +80,16 @@ class Runner:
         return True
 
 
-def tests_for(mutant: dict[str, Any], entered: dict[str, Entered]) -> list[tuple[str, float]]:
-    """Names and seconds of the tests that enter the mutant's function, in the order in which to run them."""
+def tests_for(mutant: dict[str, Any], entered: dict[str, Entered], together: float) -> list[tuple[str, float]]:
+    """Names and seconds of the tests that enter the mutant's function, in the order in which to run them: as many as
+    take `together` seconds, and always one."""
     where = f"{mutant['file']}:{mutant['function']}"
     found = [(name, e.seconds) for name, e in entered.items() if where in e.functions and e.usable(TOO_LONG_S)]
     room = "tests/core/" + str(Path(mutant["file"]).relative_to("cat3d_core").parent).removeprefix(".")
     found.sort(key=lambda test: (not test[0].startswith(room), test[1]))
     chosen, total = [], 0.0
     for name, seconds in found:
-        if total + seconds <= TOGETHER_S:
+        if not chosen or total + seconds <= together:
             chosen.append((name, seconds))
             total += seconds
     return chosen
@@ -105,7 +106,8 @@ def judge(mutant: dict[str, Any], tests: list[tuple[pytest.Item, float]], living
             say({"unusable": str(fault)})
             return
         for i, (item, seconds) in enumerate(tests):
-            say({"test": item.nodeid, "within": PATIENCE_S + PATIENCE * seconds})
+            say({"test": item.nodeid})
+            signal.setitimer(signal.ITIMER_PROF, PATIENCE_S + PATIENCE * seconds)  # its signal ends the process
             following = tests[i + 1][0] if i + 1 < len(tests) else None
             if any(report.failed for report in runtestprotocol(item, log=False, nextitem=following)):
                 say({"caught": item.nodeid})
@@ -127,8 +129,8 @@ def judge(mutant: dict[str, Any], tests: list[tuple[pytest.Item, float]], living
 
 
 def fork(work: Callable[[Callable[[dict[str, Any]], None]], None]) -> list[dict[str, Any]]:
-    """Run `work` in a fork of this process and return what it said. A message may hold `within`, the seconds until
-    the next one must have come; a process that is late is killed, with those it started, and {"late": True} added."""
+    """Run `work` in a fork of this process and return what it said, with {"late": True} at the end where its timer of
+    computing time ended it, or where it said nothing for ASLEEP_S. Processes that it started are killed."""
     reading, writing = os.pipe()
     process = os.fork()
     if process == 0:
@@ -141,22 +143,22 @@ def fork(work: Callable[[Callable[[dict[str, Any]], None]], None]) -> list[dict[
     with contextlib.suppress(OSError):
         os.setpgid(process, process)
     messages: list[dict[str, Any]] = []
-    rest, within = b"", 60.0
+    rest, late = b"", False
     while True:
-        if not select.select([reading], [], [], within)[0]:
-            messages.append({"late": True})
+        if not select.select([reading], [], [], ASLEEP_S)[0]:
+            late = True
             break
         chunk = os.read(reading, 65536)
         if not chunk:
             break
         *lines, rest = (rest + chunk).split(b"\n")
-        for line in lines:
-            messages.append(json.loads(line))
-            within = messages[-1].get("within", within)
+        messages += [json.loads(line) for line in lines]
     with contextlib.suppress(OSError):
         os.killpg(process, signal.SIGKILL)
-    os.waitpid(process, 0)
+    status = os.waitpid(process, 0)[1]
     os.close(reading)
+    if late or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGPROF):
+        messages.append({"late": True})
     return messages
 
 
@@ -184,6 +186,7 @@ def main() -> int:
     parser.add_argument("--results", type=Path, required=True)
     parser.add_argument("--again", nargs="*", default=[], help="verdicts to judge again, such as survived untested")
     parser.add_argument("--minutes", type=float, default=1e9, help="stop after so many")
+    parser.add_argument("--together", type=float, default=40.0, help="seconds of tests for one mutant, as measured")
     parser.add_argument("--tests", nargs="*", default=list(TESTS))
     options = parser.parse_args()
     mutants = pending(options.sample, options.results, set(options.again))
@@ -192,7 +195,7 @@ def main() -> int:
         return 0
     folder = options.results.parent.resolve()
     arguments = [*options.tests, "-m", "not slow", "-q", "-s", "-p", "no:cacheprovider", f"--basetemp={folder}/tmp"]
-    return pytest.main(arguments, plugins=[Runner(mutants, options.results, options.minutes)])
+    return pytest.main(arguments, plugins=[Runner(mutants, options.results, options.minutes, options.together)])
 
 
 if __name__ == "__main__":
