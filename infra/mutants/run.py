@@ -62,11 +62,12 @@ class Runner:
         if session.testsfailed:
             raise session.Interrupted(f"{session.testsfailed} errors during collection")
         torch.set_num_threads(1)
+        living = Living()
         gc.collect()
-        gc.freeze()
+        gc.freeze()  # forks share what is there; also hides it from gc.get_objects
         items = {item.nodeid: item for item in session.items}
         entered = measure(list(session.items), self.results.with_suffix(".tests.jsonl"), fork)
-        living, until = Living(), time.monotonic() + 60 * self.minutes
+        until = time.monotonic() + 60 * self.minutes
         with self.results.open("a") as file:
             for number, mutant in enumerate(self.mutants):
                 if time.monotonic() > until:
