@@ -99,6 +99,8 @@ def tests_for(mutant: dict[str, Any], entered: dict[str, Entered], together: flo
 def judge(mutant: dict[str, Any], tests: list[tuple[pytest.Item, float]], living: Living) -> dict[str, Any]:
     """What became of a mutant: its verdict, the test that caught it, how many tests it was given, the seconds."""
     started = time.monotonic()
+    if not tests:
+        return {"verdict": "untested", "test": None, "tests": 0, "seconds": 0.0}
 
     def work(say: Callable[[dict[str, Any]], None]) -> None:
         try:
@@ -125,7 +127,7 @@ def judge(mutant: dict[str, Any], tests: list[tuple[pytest.Item, float]], living
         elif "unusable" in message:
             verdict = message["unusable"]
         elif "through" in message:
-            verdict, test = ("survived" if tests else "untested"), None
+            verdict, test = "survived", None
     return {"verdict": verdict, "test": test, "tests": len(tests), "seconds": round(time.monotonic() - started, 2)}
 
 

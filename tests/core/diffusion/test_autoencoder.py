@@ -87,3 +87,16 @@ def test_it_learns():
         optimizer.step()
         history.append(numbers["psnr"])
     assert history[-1] > history[0] + 8
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_calibrated_latents_have_unit_variance(linear: bool) -> None:
+    """Each channel by itself, or with `linear` all of them together; the posterior's own spread is part of it."""
+    torch.manual_seed(0)
+    autoencoder = Autoencoder(dataclasses.replace(SIZES["tiny"].autoencoder, linear=linear)).requires_grad_(False)
+    images = _pictures(16, seed=2)
+    autoencoder.calibrate(images)
+    own = autoencoder.posterior(images)[1].double().exp().mean((0, 2, 3)) / autoencoder.latent_std.double().square()
+    variance = autoencoder.encode(images).double().var((0, 2, 3)) + own
+    variance = variance.mean() if linear else variance
+    torch.testing.assert_close(variance, torch.ones_like(variance), rtol=1e-4, atol=0)

@@ -6,6 +6,7 @@ import torch
 from cat3d_core.rays import image_rays
 from cat3d_core.synthetic import FAMILIES, random_cameras, random_scene, trace
 from cat3d_core.synthetic.dataset import mirrored, recoloured, surface_points, training_capture
+from cat3d_core.synthetic.held_out import held_out_group
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -50,3 +51,19 @@ def test_surface_points_project_onto_their_depth():
     points = surface_points(depth[:1], cameras[0])
     _, z = cameras[0].project(points)
     torch.testing.assert_close(z[0], depth[0][depth[0].isfinite()].double())
+
+
+def test_mirrored_depth_stays_with_its_pixels():
+    capture = training_capture("co3d", 3, 2, 16, with_depth=True)
+    assert torch.equal(mirrored(capture).inverse_depth, capture.inverse_depth.flip(-1))
+    # The captures' depth is in the unit of their cameras: points of one view are where the other one sees them.
+    points = surface_points(1 / capture.inverse_depth[:1], capture.cameras[0])
+    _, z = capture.cameras[0].project(points)
+    known = capture.inverse_depth[0] > 0
+    torch.testing.assert_close(z[0], 1 / capture.inverse_depth[0][known].double())
+
+
+def test_a_held_out_group_is_the_same_every_time():
+    (one, cameras), (same, again) = (held_out_group("llff", 1, 12, 4) for _ in range(2))
+    assert torch.equal(cameras.world_from_camera, again.world_from_camera)
+    assert torch.equal(one.image, same.image)
