@@ -194,3 +194,20 @@ def test_bank_of_mismatched_shapes_is_refused():
     bank = _bank()
     with pytest.raises(ValueError, match="intrinsics"):
         LatentBank(bank.latents, bank.intrinsics[:2], bank.world_from_camera, bank.family, 64)
+
+
+@pytest.mark.parametrize("what", ["position", "direction"])
+def test_a_narrow_group_is_the_nearest_views_in_position_and_direction(what: str) -> None:
+    """Two cameras beside each other that look alike, and two elsewhere or that look elsewhere."""
+    bank = _bank(2, 12)
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 12, 1, 1)
+    far = torch.arange(12) >= 6
+    if what == "position":
+        poses[:, far, 0, 3] = 1.0
+    else:
+        poses[:, far, 0, 0] = poses[:, far, 2, 2] = -1.0
+    bank = LatentBank(bank.latents, bank.intrinsics, poses, torch.tensor([0, 1]), 64)
+    latents, _ = bank.batch(40, 4, 0, "step", spread=0.5)
+    there = latents[:, :, 0, 0, 0].long() % 12 >= 6
+    assert (there == there[:, :1]).all()
+    assert 0 < int(there[:, 0].sum()) < 40

@@ -87,3 +87,11 @@ def test_chamfer_errors_are_sentences(points, message):
         chamfer_distance(points, torch.zeros(1, 3))
     with pytest.raises(ValueError, match=message):
         chamfer_distance(torch.zeros(1, 3), points)
+
+
+def test_f_score_is_the_harmonic_mean_of_precision_and_recall():
+    """The half of a plane that lies at x < 4: all its points are right, half of the plane's are found."""
+    plane = torch.cat([torch.cartesian_prod(*[torch.arange(8.0)] * 2), torch.zeros(64, 1)], dim=1)
+    result = chamfer_distance(plane[:32], plane, threshold=0.5)
+    assert (result["precision"], result["recall"]) == (1.0, 0.5)
+    assert result["fscore"] == pytest.approx(2 / 3)
