@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import sys
 import threading
@@ -46,12 +45,11 @@ class _Tracer:
 
 
 def measure(items: list[pytest.Item], path: Path, fork: Callable[..., list[dict[str, Any]]]) -> dict[str, Entered]:
-    """What each test enters, measured for those that `path` does not have yet or whose file has changed since.
+    """What each test enters, measured for those that `path` does not name yet (remove it to measure all anew).
 
     All of them run in one fork, so that this process stays as it was after collecting."""
-    digests = {item.path: hashlib.sha256(item.path.read_bytes()).hexdigest()[:12] for item in items}
     known = _read(path)
-    new = [item for item in items if known.get(item.nodeid, {}).get("digest") != digests[item.path]]
+    new = [item for item in items if item.nodeid not in known]
 
     def work(say: Callable[[dict[str, Any]], None]) -> None:
         with path.open("a") as file:
@@ -66,7 +64,7 @@ def measure(items: list[pytest.Item], path: Path, fork: Callable[..., list[dict[
                 sys.settrace(None)
                 seconds = time.process_time() - started
                 row = {
-                    "test": item.nodeid, "digest": digests[item.path], "seconds": round(seconds, 3),
+                    "test": item.nodeid, "seconds": round(seconds, 3),
                     "holds": not any(report.failed for report in reports),
                     "functions": sorted({":".join(function_name(code)) for code in tracer.seen}),
                 }  # fmt: skip
