@@ -369,3 +369,19 @@ def test_the_least_settings_are_taken(fits: dict[str, object]) -> None:
 def test_settings_outside_their_range_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="at least|lie|falls|entry"):
         dataclasses.replace(TINY, **change)
+
+
+def test_an_empty_scene_shows_a_grey_between_the_backgrounds_levels() -> None:
+    """At random for each ray with a generator, half-way between the levels without one."""
+    config = dataclasses.replace(TINY, background=(0.2, 0.6), far=1e-6, near=0.0)  # too short to meet anything
+    rays = image_rays(_views().cameras, 0)
+    field = Field(TINY, seed=1)
+    with torch.no_grad():
+        plain = render_rays(field, rays, config=config)
+        drawn = render_rays(field, rays, config=config, generator=torch.Generator().manual_seed(0))
+    assert float(plain.opacity.max()) < 1e-3
+    torch.testing.assert_close(plain.rgb, torch.full_like(plain.rgb, 0.4), rtol=0, atol=1e-3)
+    assert float(drawn.rgb.min()) > 0.199
+    assert float(drawn.rgb.max()) < 0.601
+    assert float(drawn.rgb[:, 0].std()) == pytest.approx(0.4 / 12**0.5, rel=0.1)
+    assert float((drawn.rgb[:, 0] - drawn.rgb[:, 2]).abs().max()) < 1e-3
