@@ -211,3 +211,13 @@ def test_a_narrow_group_is_the_nearest_views_in_position_and_direction(what: str
     there = latents[:, :, 0, 0, 0].long() % 12 >= 6
     assert (there == there[:, :1]).all()
     assert 0 < int(there[:, 0].sum()) < 40
+
+
+def test_a_step_says_the_learning_rate_that_it_took():
+    config = dataclasses.replace(CONFIG, warmup_steps=3, accumulate=2)
+    trainer = Trainer(config, MultiViewModel(tiny()), seed=0)
+    said = [trainer.step(*_batch(i, 1), 3) for i in range(6)]
+    assert [numbers["step"] for numbers in said] == [0, 1, 1, 2, 2, 3]
+    taken = [config.learning_rate_at(max(0, int(numbers["step"]) - 1)) for numbers in said]
+    assert [numbers["lr"] for numbers in said] == pytest.approx(taken)
+    assert trainer.optimizer.param_groups[0]["lr"] == pytest.approx(config.learning_rate_at(2))

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import types
+
+import pytest
 import torch
 
+from cat3d_core.matching import training
 from cat3d_core.matching.composite import Composite
 from cat3d_core.matching.layers import UNet
 from cat3d_core.matching.losses import dissimilarity
@@ -40,3 +44,14 @@ def test_dissimilarity_is_one_minus_ssim_of_boxes() -> None:
     torch.testing.assert_close(dissimilarity(a, b), 1 - luminance * contrast)
     wide = torch.rand(2, 3, 8, 9, generator=torch.Generator().manual_seed(3))
     torch.testing.assert_close(dissimilarity(wide, wide), torch.tensor(0.0), rtol=0, atol=1e-6)
+
+
+def test_validation_is_the_mean_psnr_of_clamped_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Off by 0.1 everywhere: 20 dB; by 0.01: 40 dB; too bright where the truth is white: no error."""
+    truth = torch.full((3, 3, 4, 4), 0.5)
+    truth[2] = 1.0
+    colour = truth + torch.tensor([0.1, -0.01, 0.7]).view(3, 1, 1, 1)
+    monkeypatch.setattr(training, "forward", lambda network, batch: (types.SimpleNamespace(colour=colour), None))
+    batch = types.SimpleNamespace(image=truth, truth=truth)
+    found = training.validation_psnr(None, batch, "float32")  # type: ignore[arg-type]
+    assert found == pytest.approx((20 + 40 + 100) / 3, abs=1e-3)
