@@ -12,7 +12,7 @@ from cat3d_core.cameras import Cameras
 from cat3d_core.normalization import Similarity
 from cat3d_core.quaternions import quaternion_product, quaternions_from_rotations, rotation_matrices
 from cat3d_core.reconstruction.render import Render
-from cat3d_core.splats.from_renders import OPACITY, WIDTH, _discs
+from cat3d_core.splats.from_renders import OPACITY, WIDTH, _discs, from_renders
 from cat3d_core.splats.gaussians import (
     SH_0,
     Gaussians,
@@ -118,3 +118,15 @@ def test_discs_of_a_render_have_the_area_of_their_pixels(cosine: float) -> None:
     torch.testing.assert_close(normals, normal.reshape(-1, 3))
     torch.testing.assert_close(opacities, torch.full((16,), OPACITY))
     torch.testing.assert_close(colours, torch.full((16, 3), 0.25))
+
+
+@pytest.mark.parametrize("most", [1, 5, 100])
+def test_splats_of_a_render_are_at_most_as_many_as_asked_for(most: int) -> None:
+    k = torch.tensor([[[8.0, 0, 4.0], [0, 8.0, 4.0], [0, 0, 1.0]]])
+    cameras = Cameras(k, torch.eye(4)[None], torch.tensor([[8, 8]]))
+    depth = torch.linspace(1, 3, 64).view(8, 8)
+    normal = torch.tensor([0.0, 0.0, -1.0]).expand(8, 8, 3)
+    made = from_renders([Render(torch.rand(8, 8, 3), depth, depth, torch.ones(8, 8), normal)], cameras, most)
+    assert 1 <= len(made) <= most
+    assert len(made) > 32 or most < 64  # a few pixels share a cell
+    assert bool(torch.isfinite(made.log_scales).all())

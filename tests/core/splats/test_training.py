@@ -151,6 +151,12 @@ def test_the_perceptual_loss_sees_patches(scene: tuple[Views, Views]) -> None:
     terms = [trainer.step() for _ in range(4)]
     assert seen == [torch.Size([1, 3, 24, 24])] * 2
     assert ["perceptual" in numbers for numbers in terms] == [True, False, True, False]
+    # At every k-th step, k times the weight; captured pixels count whole.
+    captured = dataclasses.replace(views, captured=torch.ones_like(views.captured))
+    for every in (1, 3):
+        config = dataclasses.replace(SHORT, patch_size=24, lpips_every=every, lpips_weight=0.2)
+        trainer = SplatTrainer(config, captured, 0, perceptual=lambda a, b: torch.full((len(a),), 0.5))
+        assert trainer.step()["perceptual"] == pytest.approx(every * 0.2 * 0.5)
 
 
 def test_a_state_that_does_not_fit_is_refused(scene: tuple[Views, Views]) -> None:
@@ -320,3 +326,19 @@ def test_splats_start_as_wide_as_the_pixels_that_each_stands_for(scene: tuple[Vi
         wanted = torch.where(far, 2 * 0.5 * 20.0, 0.5 * 2.0)[:, None].expand(-1, 3) / focal * each**0.5
         torch.testing.assert_close(made.scales, wanted, rtol=1e-4, atol=0)
         torch.testing.assert_close(made.opacities, torch.full_like(made.opacities, config.start_opacity))
+
+
+@pytest.mark.parametrize(
+    "fits", [{"lr_final": 1.0}, {"lr_means_final": 0.0}, {"grow": 1.0}, {"shell": 0.0}, {"most": SHORT.start}]
+)
+def test_settings_at_the_end_of_their_range_are_taken(fits: dict[str, float]) -> None:
+    dataclasses.replace(SHORT, **fits)
+
+
+def test_the_widest_gap_is_filled_first() -> None:
+    """Cameras on a line at 0, 1 and 3: half-way between 0 and 3, then 1 and 3, then 0 and 1."""
+    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    poses[:, 0, 3] = torch.tensor([0.0, 1.0, 3.0])
+    k = torch.eye(3, dtype=torch.float64).expand(3, 3, 3)
+    every = between(Cameras(k, poses, torch.tensor([[8, 8]] * 3)), 6)
+    assert every.centers[:, 0].tolist() == pytest.approx([0, 1, 3, 1.5, 2, 0.5])
