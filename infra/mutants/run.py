@@ -197,7 +197,7 @@ def main() -> int:
     if not mutants:
         return 0
     folder = options.results.parent.resolve()
-    arguments = [*options.tests, "-m", "not slow", "-q", "-s", "-p", "no:cacheprovider", f"--basetemp={folder}/tmp"]
+    arguments = [*options.tests, "-m", "not slow", "-q", "-s", "-p", "no:cacheprovider", f"--basetemp={folder}/files"]
     return pytest.main(arguments, plugins=[Runner(mutants, options.results, options.minutes, options.together)])
 
 

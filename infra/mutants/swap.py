@@ -30,9 +30,9 @@ class Living:
         self._by_code: dict[tuple[str, str, int], list[FunctionType]] = defaultdict(list)
         self._caches: list[Any] = []
         for thing in gc.get_objects():
-            if isinstance(thing, FunctionType) and thing.__code__.co_filename.startswith(CORE):
+            if type(thing) is FunctionType and thing.__code__.co_filename.startswith(CORE):
                 self._by_code[_key(thing.__code__)].append(thing)
-            elif isinstance(thing, functools._lru_cache_wrapper):
+            elif type(thing) is functools._lru_cache_wrapper and str(thing.__module__).startswith("cat3d_core"):
                 self._caches.append(thing)
 
     def swap(self, mutant: dict[str, Any]) -> None:

@@ -21,7 +21,6 @@ from cat3d_core.splats.gaussians import Gaussians
 from cat3d_core.splats.rasterize import render
 from cat3d_core.splats.rasterize_cpu import available
 from cat3d_core.splats.reconstructor import Splats
-from cat3d_core.splats.start import start
 from cat3d_core.splats.trainer import SplatTrainer, expand, train
 from cat3d_core.splats.viewpoints import between
 from cat3d_core.synthetic import random_cameras, random_scene, trace
@@ -293,52 +292,3 @@ def test_cameras_between_others_look_where_both_look() -> None:
         forward = cameras.forward[a].double() + cameras.forward[b].double()
         shown.append(float(every.forward[i] @ forward / forward.norm()))
     assert min(shown) > 0.9, shown
-
-
-def test_learning_rates_fall_logarithmically(scene: tuple[Views, Views]) -> None:
-    trainer = SplatTrainer(dataclasses.replace(SHORT, iterations=40, lr_final=0.25), scene[0], 0)
-    config = trainer.config
-    ends = {"means": config.lr_means_final / config.lr_means}
-    first = {name: getattr(config, f"lr_{name}") for name in trainer.learning_rates()}
-    for done in (0, 10, 40, 50):  # never below the last step's
-        trainer.iteration = done
-        share = min(1.0, done / 40)
-        wanted = {name: rate * ends.get(name, 0.25) ** share for name, rate in first.items()}
-        assert trainer.learning_rates() == pytest.approx(wanted)
-    still = SplatTrainer(dataclasses.replace(SHORT, lr_means=0.0, lr_means_final=0.0), scene[0], 0)
-    assert still.learning_rates()["means"] == 0.0
-
-
-def test_splats_start_as_wide_as_the_pixels_that_each_stands_for(scene: tuple[Views, Views]) -> None:
-    """Half a pixel's width of the surface, by the root of the pixels for each; twice as wide on the far shell."""
-    views, _ = scene
-    pixels = [torch.full((32, 32, 3), 128, dtype=torch.uint8)] * len(views)
-    depths = [torch.full((32, 32), 2.0)] * len(views)
-    known = Views.from_images(views.cameras, pixels, views.captured, depths=depths)
-    focal = float(views.cameras.intrinsics[0, 0, 0])
-    assert torch.equal(views.cameras.intrinsics[:, 0, 0], views.cameras.intrinsics[:1, 0, 0].expand(len(views)))
-    each = len(views) * 32 * 32 / 500
-    for shell in (0.0, 0.5):
-        config = dataclasses.replace(SHORT, start=500, shell=shell, far=20.0, near=0.3)
-        made = start(known, config, torch.Generator().manual_seed(0))
-        far = made.scales[:, 0] > 0.5 * 20.0 / focal * each**0.5
-        assert 0.8 * shell <= float(far.float().mean()) <= 1.2 * shell
-        wanted = torch.where(far, 2 * 0.5 * 20.0, 0.5 * 2.0)[:, None].expand(-1, 3) / focal * each**0.5
-        torch.testing.assert_close(made.scales, wanted, rtol=1e-4, atol=0)
-        torch.testing.assert_close(made.opacities, torch.full_like(made.opacities, config.start_opacity))
-
-
-@pytest.mark.parametrize(
-    "fits", [{"lr_final": 1.0}, {"lr_means_final": 0.0}, {"grow": 1.0}, {"shell": 0.0}, {"most": SHORT.start}]
-)
-def test_settings_at_the_end_of_their_range_are_taken(fits: dict[str, float]) -> None:
-    dataclasses.replace(SHORT, **fits)
-
-
-def test_the_widest_gap_is_filled_first() -> None:
-    """Cameras on a line at 0, 1 and 3: half-way between 0 and 3, then 1 and 3, then 0 and 1."""
-    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
-    poses[:, 0, 3] = torch.tensor([0.0, 1.0, 3.0])
-    k = torch.eye(3, dtype=torch.float64).expand(3, 3, 3)
-    every = between(Cameras(k, poses, torch.tensor([[8, 8]] * 3)), 6)
-    assert every.centers[:, 0].tolist() == pytest.approx([0, 1, 3, 1.5, 2, 0.5])
