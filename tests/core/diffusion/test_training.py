@@ -211,6 +211,12 @@ def test_a_narrow_group_is_the_nearest_views_in_position_and_direction(what: str
     there = latents[:, :, 0, 0, 0].long() % 12 >= 6
     assert (there == there[:, :1]).all()
     assert 0 < int(there[:, 0].sum()) < 40
+    # One camera apart from eleven: only groups round itself show it.
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 12, 1, 1)
+    poses[:, 11] = bank.world_from_camera[0, 11]
+    lone = LatentBank(bank.latents, bank.intrinsics, poses, torch.tensor([0, 1]), 64)
+    latents, _ = lone.batch(60, 6, 0, "lone", spread=0.5)
+    assert 0 < int((latents[:, :, 0, 0, 0].long() % 12 == 11).any(1).sum()) < 20
 
 
 def test_a_step_says_the_learning_rate_that_it_took():

@@ -73,3 +73,14 @@ def test_splats_start_as_wide_as_the_pixels_that_each_stands_for(wall: Views) ->
         wanted = torch.where(far, 2 * 0.5 * 20.0, 0.5 * 2.0)[:, None].expand(-1, 3) / focal * each**0.5
         torch.testing.assert_close(made.scales, wanted, rtol=1e-4, atol=0)
         torch.testing.assert_close(made.opacities, torch.full_like(made.opacities, config.start_opacity))
+
+
+def test_splats_of_unknown_depth_start_between_near_and_far(wall: Views) -> None:
+    """Pictures of noise: the depth at which others look most alike is any; a splat's width tells which was taken."""
+    g = torch.Generator().manual_seed(0)
+    noise = [torch.randint(0, 256, (32, 32, 3), generator=g, dtype=torch.uint8) for _ in range(12)]
+    config = dataclasses.replace(SHORT, start=1500, shell=0.0, near=0.5, far=8.0)
+    made = start(Views.from_images(wall.cameras, noise, wall.captured), config, g)
+    depth = made.scales[:, 0] * float(wall.cameras.intrinsics[0, 0, 0]) / (0.5 * (12 * 32 * 32 / 1500) ** 0.5)
+    assert 0.499 < float(depth.min()) < 0.55
+    assert 6 < float(depth.max()) < 8.01
