@@ -54,7 +54,7 @@ def test_surface_points_project_onto_their_depth():
 
 
 def test_mirrored_depth_stays_with_its_pixels():
-    capture = training_capture("llff", 3, 2, 32, with_depth=True)
+    capture = training_capture("llff", 7, 2, 32, with_depth=True)  # in another unit than the scene
     assert torch.equal(mirrored(capture).inverse_depth, capture.inverse_depth.flip(-1))
     # Depth is in the unit of the cameras: a place that one view sees is at the other one's depth, where both see it.
     cameras, inverse = capture.cameras, capture.inverse_depth.double()
