@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DEMO_OUT ?= outputs/demo
 DEMO_ARGS ?=
 
-.PHONY: demo test test-slow lint docs figures peers setup clean
+.PHONY: demo test test-slow lint docs figures peers mutants setup clean
 
 setup: $(VENV)/.installed
 
@@ -44,6 +44,24 @@ figures: setup
 # Programs of others, in an environment of their own, for `cat3d bench peers`. Nothing else needs it.
 peers:
 	PYTHON=$(PYTHON) sh infra/peers.sh
+
+# Small faults in cat3d_core, one at a time: do the quick tests notice? COUNT of each file of ONLY, drawn by SEED; goes on
+# where it was interrupted. AGAIN="survived untested" judges those anew, after new tests. TOGETHER: seconds of tests that
+# one mutant is given.
+ONLY ?= cat3d_core
+COUNT ?= 25
+SEED ?= 0
+AGAIN ?=
+TOGETHER ?= 10
+MUTANTS_OUT ?= outputs/mutants/$(subst /,_,$(ONLY))_$(COUNT)_$(SEED)
+mutants: setup
+	[ -x .venv-mutants/bin/python ] || $(PYTHON) -m venv .venv-mutants
+	.venv-mutants/bin/python -m pip install -q -r infra/mutants/requirements.txt
+	[ -f $(MUTANTS_OUT)/sample.jsonl ] || .venv-mutants/bin/python infra/mutants/generate.py \
+	    --only $(ONLY) --count $(COUNT) --seed $(SEED) --out $(MUTANTS_OUT)/sample.jsonl
+	OMP_NUM_THREADS=1 $(BIN)/python -m infra.mutants.run --sample $(MUTANTS_OUT)/sample.jsonl \
+	    --results $(MUTANTS_OUT)/results.jsonl --again $(AGAIN) --together $(TOGETHER)
+	$(BIN)/python -m infra.mutants.report $(MUTANTS_OUT)/results.jsonl --survivors
 
 clean:
 	rm -rf $(VENV) outputs build *.egg-info

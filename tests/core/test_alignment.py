@@ -91,6 +91,11 @@ def test_umeyama_refuses_too_few_and_non_finite_points():
         umeyama(torch.zeros(2, 3), torch.zeros(2, 3))
     with pytest.raises(ValueError, match="NaN or infinite"):
         umeyama(torch.full((4, 3), math.nan), torch.zeros(4, 3))
+    one = torch.randn(4, 3, generator=torch.Generator().manual_seed(0))
+    one[2, 1] = math.inf
+    for pair in ((one, torch.randn(4, 3)), (torch.randn(4, 3), one)):
+        with pytest.raises(ValueError, match="NaN or infinite"):
+            umeyama(*pair)
 
 
 @pytest.mark.parametrize("kind", ["general", "collinear", "coincident", "two", "one"])

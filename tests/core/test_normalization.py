@@ -93,6 +93,8 @@ def test_depth_is_taken_from_points_then_bounds() -> None:
     assert normalize_scene(cameras, points).scale == pytest.approx(1 / 3, rel=0.1)
     bounds = torch.tensor([[2.0, 6.0], [2.0, 6.0]], dtype=torch.float64)
     assert normalize_scene(cameras, depth_bounds=bounds).scale == pytest.approx(1 / 3)
+    flat = torch.tensor([[4.0, 4.0], [4.0, 4.0]], dtype=torch.float64)  # near and far are one plane
+    assert normalize_scene(cameras, depth_bounds=flat).scale == pytest.approx(1 / 4)
     nonsense = torch.tensor([[0.0, -1.0], [float("nan"), 2.0]], dtype=torch.float64)
     assert normalize_scene(cameras, depth_bounds=nonsense).method == "extent"
 

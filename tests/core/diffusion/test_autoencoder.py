@@ -87,3 +87,40 @@ def test_it_learns():
         optimizer.step()
         history.append(numbers["psnr"])
     assert history[-1] > history[0] + 8
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_calibrated_latents_have_unit_variance(linear: bool) -> None:
+    """Each channel by itself, or with `linear` all of them together; the posterior's own spread is part of it."""
+    torch.manual_seed(0)
+    autoencoder = Autoencoder(dataclasses.replace(SIZES["tiny"].autoencoder, linear=linear)).requires_grad_(False)
+    images = _pictures(16, seed=2)
+    autoencoder.calibrate(images)
+    own = autoencoder.posterior(images)[1].double().exp().mean((0, 2, 3)) / autoencoder.latent_std.double().square()
+    variance = autoencoder.encode(images).double().var((0, 2, 3)) + own
+    variance = variance.mean() if linear else variance
+    torch.testing.assert_close(variance, torch.ones_like(variance), rtol=1e-4, atol=0)
+
+
+def test_the_loss_is_the_weighted_sum_of_its_terms():
+    """Each term by itself, in float64: what a weight adds is that weight times the term."""
+    torch.manual_seed(0)
+    autoencoder = Autoencoder(SIZES["tiny"].autoencoder).double().requires_grad_(False)
+    images = _pictures(3, seed=5).double()
+    noise = torch.randn(3, 8, 4, 4, generator=torch.Generator().manual_seed(1)).double()
+    mean, log_variance = autoencoder.posterior(images)
+    decoded = autoencoder.decode_raw(mean + (log_variance / 2).exp() * noise)
+    edges = (decoded - images).diff(dim=-1).abs().mean() + (decoded - images).diff(dim=-2).abs().mean()
+    kl = 0.5 * (mean**2 + log_variance.exp() - 1 - log_variance).sum((1, 2, 3)).mean()
+
+    def loss(**weights: float) -> float:
+        settings = {"kl_weight": 0.0, "gradient_weight": 0.0, "perceptual_weight": 0.0} | weights
+        far = lambda a, b: (a - b).abs().sum((1, 2, 3))  # noqa: E731
+        return float(autoencoder_loss(autoencoder, images, noise, perceptual=far, **settings)[0])
+
+    plain = loss()
+    assert plain == pytest.approx(float((decoded - images).abs().mean()), rel=1e-5)
+    assert loss(kl_weight=0.01) - plain == pytest.approx(0.01 * float(kl), rel=1e-4)
+    assert loss(gradient_weight=0.5) - plain == pytest.approx(0.5 * float(edges), rel=1e-4)
+    apart = float((decoded.clamp(0, 1) - images).abs().sum((1, 2, 3)).mean())
+    assert loss(perceptual_weight=0.1) - plain == pytest.approx(0.1 * apart, rel=1e-4)

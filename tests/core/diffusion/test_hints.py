@@ -203,6 +203,8 @@ def test_the_bank_draws_groups_with_as_many_given_views_as_asked_for():
     one = cameras[int(group[2])]
     torch.testing.assert_close(matrix_rays(matrices[2], 4, 4), raymap(one, one.world_from_camera[0], 4, 4))
     assert torch.equal(bank.batch(40, 3, 0, "step")[0], latents)
+    alike = dataclasses.replace(bank, family=torch.zeros(count, dtype=torch.int64))
+    assert set(alike.batch(40, 3, 0, "step")[0][:, 0, 0, 0, 0].tolist()) == {1.0, 3.0, 5.0}
     with pytest.raises(ValueError, match="no groups with 2 given views"):
         bank.batch(1, 2, 0)
     with pytest.raises(ValueError, match="needs hints"):

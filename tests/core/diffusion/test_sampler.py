@@ -135,3 +135,11 @@ def test_a_network_that_knows_the_answer_gives_it():
             config = SamplerConfig(solver, nodes, 6, GuidanceConfig(1.0))
             got = sample(model, latents, cameras, noise, config)
             torch.testing.assert_close(got, truth, rtol=0, atol=1e-4)
+
+
+def test_the_reference_is_the_papers_and_unknown_solvers_are_refused():
+    """CAT3D, section 3.1: DDIM, 50 steps, guidance 3."""
+    config = SamplerConfig.reference()
+    assert (config.solver, config.nodes, config.steps, config.guidance.scale) == ("ddim", "trailing", 50, 3.0)
+    with pytest.raises(ValueError, match="euler"):
+        SamplerConfig("euler")

@@ -194,3 +194,36 @@ def test_bank_of_mismatched_shapes_is_refused():
     bank = _bank()
     with pytest.raises(ValueError, match="intrinsics"):
         LatentBank(bank.latents, bank.intrinsics[:2], bank.world_from_camera, bank.family, 64)
+
+
+@pytest.mark.parametrize("what", ["position", "direction"])
+def test_a_narrow_group_is_the_nearest_views_in_position_and_direction(what: str) -> None:
+    """Two cameras beside each other that look alike, and two elsewhere or that look elsewhere."""
+    bank = _bank(2, 12)
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 12, 1, 1)
+    far = torch.arange(12) >= 6
+    if what == "position":
+        poses[:, far, 0, 3] = 1.0
+    else:
+        poses[:, far, 0, 0] = poses[:, far, 2, 2] = -1.0
+    bank = LatentBank(bank.latents, bank.intrinsics, poses, torch.tensor([0, 1]), 64)
+    latents, _ = bank.batch(40, 4, 0, "step", spread=0.5)
+    there = latents[:, :, 0, 0, 0].long() % 12 >= 6
+    assert (there == there[:, :1]).all()
+    assert 0 < int(there[:, 0].sum()) < 40
+    # One camera apart from eleven: only groups round itself show it.
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 12, 1, 1)
+    poses[:, 11] = bank.world_from_camera[0, 11]
+    lone = LatentBank(bank.latents, bank.intrinsics, poses, torch.tensor([0, 1]), 64)
+    latents, _ = lone.batch(60, 6, 0, "lone", spread=0.5)
+    assert 0 < int((latents[:, :, 0, 0, 0].long() % 12 == 11).any(1).sum()) < 20
+
+
+def test_a_step_says_the_learning_rate_that_it_took():
+    config = dataclasses.replace(CONFIG, warmup_steps=3, accumulate=2)
+    trainer = Trainer(config, MultiViewModel(tiny()), seed=0)
+    said = [trainer.step(*_batch(i, 1), 3) for i in range(6)]
+    assert [numbers["step"] for numbers in said] == [0, 1, 1, 2, 2, 3]
+    taken = [config.learning_rate_at(max(0, int(numbers["step"]) - 1)) for numbers in said]
+    assert [numbers["lr"] for numbers in said] == pytest.approx(taken)
+    assert trainer.optimizer.param_groups[0]["lr"] == pytest.approx(config.learning_rate_at(2))

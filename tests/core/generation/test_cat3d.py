@@ -41,6 +41,9 @@ def test_the_spec_is_that_of_the_configuration() -> None:
     )
     assert spec.reference == dataclasses.replace(PAPER, guidance=GuidanceConfig(1.0)), "guidance stays the model's"
     assert cat3d_spec(tiny()).advice == MEASURED
+    assert cat3d_spec(tiny()).wants == frozenset()
+    told = dataclasses.replace(tiny(), unet=dataclasses.replace(tiny().unet, hints=True))
+    assert cat3d_spec(told).wants == frozenset({"hints"})
 
 
 def test_cost_counts_guidance_twice_and_short_groups_as_full_ones() -> None:

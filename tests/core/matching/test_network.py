@@ -13,7 +13,7 @@ from cat3d_core.matching.checkpoint import describe_sweep, load_sweep, save_swee
 from cat3d_core.matching.composite import Composite
 from cat3d_core.matching.config import SweepConfig
 from cat3d_core.matching.hint import Hint, hint, observe, photo_depth
-from cat3d_core.matching.network import SweepNetwork
+from cat3d_core.matching.network import SweepNetwork, partners
 from tests.core.strategies import orbit, random_similarity
 
 SMALL = SweepConfig(
@@ -132,3 +132,12 @@ def test_composite_follows_confidence() -> None:
     colour, sample = torch.ones(1, 3, 1, 2), torch.zeros(1, 3, 1, 2)
     out = mix(colour, torch.tensor([[[0.9, 0.1]]]), sample)
     torch.testing.assert_close(out, torch.tensor([1.0, 0.0]).expand(1, 3, 1, 2), rtol=0, atol=1e-6)
+
+
+def test_partners_are_the_nearest_others() -> None:
+    """On a line at 0, 1, 3, 7, looking one way: nobody is their own partner."""
+    pose = torch.eye(4).repeat(4, 1, 1)
+    pose[:, 0, 3] = torch.tensor([0.0, 1.0, 3.0, 7.0])
+    assert partners(pose, 2).tolist() == [[1, 2], [0, 2], [1, 0], [2, 1]]
+    assert partners(pose, 9).shape == (4, 3)
+    assert partners(pose[:1], 2).shape == (1, 0)

@@ -87,3 +87,12 @@ def test_chamfer_errors_are_sentences(points, message):
         chamfer_distance(points, torch.zeros(1, 3))
     with pytest.raises(ValueError, match=message):
         chamfer_distance(torch.zeros(1, 3), points)
+
+
+def test_f_score_is_the_harmonic_mean_of_precision_and_recall():
+    """Half of a plane's points and as many far away: half of them are right, a quarter of the plane is found."""
+    plane = torch.cat([torch.cartesian_prod(*[torch.arange(8.0)] * 2), torch.zeros(64, 1)], dim=1)
+    points = torch.cat([plane[:16], plane[:16] + 100])
+    result = chamfer_distance(points, plane, threshold=0.5)
+    assert (result["precision"], result["recall"]) == (0.5, 0.25)
+    assert result["fscore"] == pytest.approx(2 * 0.5 * 0.25 / 0.75)

@@ -42,3 +42,10 @@ def test_truth_of_another_size_and_no_surface():
     assert geometry_row(np.full((16, 16), 2.0), np.ones((16, 16)), truth, camera())["surface_chamfer"] == 0.0
     assert geometry_row(np.full((16, 16), 2.0), np.zeros((16, 16)), truth, camera()) == {"depth_abs_rel": 0.0}
     assert geometry_row(np.full((16, 16), 2.0), np.ones((16, 16)), np.full((32, 32), np.inf), camera()) == {}
+
+
+def test_without_a_known_depth_there_are_no_errors_of_it():
+    black, opaque = torch.zeros(3, 16, 16), torch.ones(16, 16)
+    for metric in METRICS:
+        if metric.name in ("depth_abs_rel", "surface_chamfer"):
+            assert metric.measure(Comparison("google", black, black, None, opaque, opaque, None, camera())) is None

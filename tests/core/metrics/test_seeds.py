@@ -65,6 +65,11 @@ def test_quantiles_are_never_smaller_than_scipys(freedom: float) -> None:
     assert exact - 5e-4 <= t95(freedom) <= 1.03 * exact
 
 
+def test_below_one_degree_of_freedom_the_quantile_is_that_of_one() -> None:
+    """Welch's degrees of freedom are never fewer, but for rounding."""
+    assert t95(1 - 1e-12) == t95(1) == pytest.approx(stats.t.ppf(0.975, 1), abs=5e-4)
+
+
 def test_infinite_and_equal_values() -> None:
     endless = mean_over_seeds({"a": [math.inf, math.inf]})
     assert endless == Mean(math.inf)

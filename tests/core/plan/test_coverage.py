@@ -67,3 +67,15 @@ def test_bins_have_equal_solid_angles() -> None:
     assert share.shape == (BINS,)
     # Counts of about 1560 with a binomial deviation of 2.5%: five of them.
     assert (share * BINS - 1).abs().max() < 0.13
+
+
+def test_voxels_are_the_middles_of_a_cube_of_the_scenes_frame() -> None:
+    """Closed form: a cube of 1.5 times the scene's distance, about its centre, along its axes."""
+    frame = scene_frame(ring(5))
+    middles = [(i + 0.5) * 1.5 / 3 - 0.75 for i in range(3)]
+    expected = torch.tensor([[x, y, z] for x in middles for y in middles for z in middles], dtype=torch.float64)
+    torch.testing.assert_close(frame.local(voxel_grid(frame, resolution=3)), expected)
+    point = frame.center + frame.distance * expected[5:6] @ frame.axes  # at x, y, z places 0, 1, 2
+    near = voxel_grid(frame, point, resolution=3)
+    beside = [i for i in range(27) if i // 9 < 2 and i % 3 > 0]
+    torch.testing.assert_close(frame.local(near), expected[beside])

@@ -245,3 +245,12 @@ def test_partial_orbit_stays_on_the_captured_side() -> None:
     captured = patch()
     views, _, _, frame = trajectory("dtu", captured)
     assert ((views.forward @ frame.forward) > 0).all()
+
+
+def test_the_forward_circle_is_closed_and_evenly_spaced() -> None:
+    """As many equal steps as views: the last one leads back to the first view, without standing there twice."""
+    captured = forward_facing()
+    frame = scene_frame(captured)
+    centers = forward_circle(frame, captured, 40, Shift())[:, :3, 3]
+    step = (centers.roll(-1, 0) - centers).norm(dim=-1)
+    torch.testing.assert_close(step, step.mean().expand(40), rtol=5e-3, atol=0)

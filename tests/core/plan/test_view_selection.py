@@ -13,6 +13,7 @@ from cat3d_core.view_selection import (
     NO_VIEW,
     consecutive_groups,
     covering_radius,
+    evenly,
     farthest_points,
     nearest_views,
     pose_distance,
@@ -96,3 +97,10 @@ def test_views_taken_first_come_before_nearer_ones() -> None:
     kept = nearest_views(views[[6]], views, 3, 1.0, first=2)
     assert set(kept[:2]) == {0, 1}
     assert kept[2] == 6
+
+
+@pytest.mark.parametrize(
+    ("count", "most", "expected"), [(10, 4, [0, 3, 6, 9]), (3, 8, [0, 1, 2]), (7, 1, [0]), (0, 3, [])]
+)
+def test_evenly_goes_from_the_first_to_the_last(count: int, most: int, expected: list[int]) -> None:
+    assert evenly(count, most) == expected

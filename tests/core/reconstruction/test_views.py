@@ -114,3 +114,10 @@ def test_the_pixels_that_count_are_found_by_their_number() -> None:
         number = torch.arange(len(rows))
         xy = views.pixel(torch.full_like(number, view), number)
         assert torch.equal(xy, torch.stack([columns, rows], -1))
+
+
+@pytest.mark.parametrize("size", [(6, 1), (1, 6)])
+def test_views_one_pixel_wide_or_high_cannot_be_halved(size: tuple[int, int]) -> None:
+    image = torch.zeros(size[1], size[0], 3, dtype=torch.uint8)
+    with pytest.raises(ValueError, match="View 0 is too small to be halved"):
+        Views.from_images(cameras(size), [image], torch.tensor([True])).halved()

@@ -57,3 +57,9 @@ def test_samples_are_of_the_specs_size_and_windows(model: SevaModel) -> None:
     wide = next(iter(generator.sample([_group(generator, 128)], sampler)))
     assert wide.shape == (2, 4, 16, 16)
     assert bool(torch.isfinite(wide).all())
+
+
+@pytest.mark.parametrize("side", [0, -64, 100])
+def test_images_of_no_size_or_an_odd_one_are_refused(side: int) -> None:
+    with pytest.raises(ValueError, match="multiple"):
+        replace(TINY, image_size=side)

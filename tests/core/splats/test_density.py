@@ -69,3 +69,9 @@ def test_noise_stirs_only_what_hardly_shows_along_its_own_axes() -> None:
     gate = 1 / (1 + math.exp(-0.5))
     expected = [0.5 * gate, 0.5 * gate * math.exp(-1), 0.5 * gate * math.exp(-9)]
     assert step[:2000].std(0).tolist() == pytest.approx(expected, rel=0.05)
+
+
+def test_copies_of_what_does_not_show_keep_its_size() -> None:
+    opacity, factor = split(torch.zeros(3), torch.tensor([1, 2, 20]))
+    assert torch.equal(opacity, torch.zeros(3))
+    assert torch.equal(factor, torch.ones(3))

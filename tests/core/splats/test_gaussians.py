@@ -8,8 +8,11 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
+from cat3d_core.cameras import Cameras
 from cat3d_core.normalization import Similarity
 from cat3d_core.quaternions import quaternion_product, quaternions_from_rotations, rotation_matrices
+from cat3d_core.reconstruction.render import Render
+from cat3d_core.splats.from_renders import OPACITY, WIDTH, _discs, from_renders
 from cat3d_core.splats.gaussians import (
     SH_0,
     Gaussians,
@@ -98,3 +101,32 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
         Gaussians(g.means, g.quaternions, g.log_scales, g.logits, g.harmonics.expand(-1, 5, -1))
     with pytest.raises(ValueError, match="logits missing"):
         Gaussians.from_tensors({n: v for n, v in g.tensors().items() if n != "logits"})
+
+
+@pytest.mark.parametrize("cosine", [1.0, 0.8])
+def test_discs_of_a_render_have_the_area_of_their_pixels(cosine: float) -> None:
+    """A pixel's image of a surface is longer by 1 / cosine one way; a round disc of the same area by its root."""
+    height, width = 4, 4
+    k = torch.tensor([[[400.0, 0, 2.0], [0, 400.0, 2.0], [0, 0, 1.0]]])  # all rays within half a degree of the axis
+    cameras = Cameras(k, torch.eye(4)[None], torch.tensor([[width, height]]))
+    depth, one = torch.full((height, width), 3.0), torch.ones(height, width)
+    normal = torch.tensor([(1 - cosine**2) ** 0.5, 0.0, -cosine]).expand(height, width, 3)
+    image = torch.full((height, width, 3), 0.25)
+    means, normals, colours, opacities, widths = _discs(Render(image, depth, depth, one, normal), cameras, 0)
+    torch.testing.assert_close(widths, torch.full((16,), WIDTH / 400 * 3 / cosine**0.5), rtol=0.01, atol=0)
+    torch.testing.assert_close(means[:, 2], torch.full((16,), 3.0))
+    torch.testing.assert_close(normals, normal.reshape(-1, 3))
+    torch.testing.assert_close(opacities, torch.full((16,), OPACITY))
+    torch.testing.assert_close(colours, torch.full((16, 3), 0.25))
+
+
+@pytest.mark.parametrize("most", [1, 5, 100])
+def test_splats_of_a_render_are_at_most_as_many_as_asked_for(most: int) -> None:
+    k = torch.tensor([[[8.0, 0, 4.0], [0, 8.0, 4.0], [0, 0, 1.0]]])
+    cameras = Cameras(k, torch.eye(4)[None], torch.tensor([[8, 8]]))
+    depth = torch.linspace(1, 3, 64).view(8, 8)
+    normal = torch.tensor([0.0, 0.0, -1.0]).expand(8, 8, 3)
+    made = from_renders([Render(torch.rand(8, 8, 3), depth, depth, torch.ones(8, 8), normal)], cameras, most)
+    assert 1 <= len(made) <= most
+    assert len(made) > 32 or most < 64  # a few pixels share a cell
+    assert bool(torch.isfinite(made.log_scales).all())

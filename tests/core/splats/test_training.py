@@ -150,6 +150,12 @@ def test_the_perceptual_loss_sees_patches(scene: tuple[Views, Views]) -> None:
     terms = [trainer.step() for _ in range(4)]
     assert seen == [torch.Size([1, 3, 24, 24])] * 2
     assert ["perceptual" in numbers for numbers in terms] == [True, False, True, False]
+    # At every k-th step, k times the weight; captured pixels count whole.
+    captured = dataclasses.replace(views, captured=torch.ones_like(views.captured))
+    for every in (1, 3):
+        config = dataclasses.replace(SHORT, patch_size=24, lpips_every=every, lpips_weight=0.2)
+        trainer = SplatTrainer(config, captured, 0, perceptual=lambda a, b: torch.full((len(a),), 0.5))
+        assert trainer.step()["perceptual"] == pytest.approx(every * 0.2 * 0.5)
 
 
 def test_a_state_that_does_not_fit_is_refused(scene: tuple[Views, Views]) -> None:

@@ -6,6 +6,7 @@ import torch
 from cat3d_core.rays import image_rays
 from cat3d_core.synthetic import FAMILIES, random_cameras, random_scene, trace
 from cat3d_core.synthetic.dataset import mirrored, recoloured, surface_points, training_capture
+from cat3d_core.synthetic.held_out import held_out_group
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -50,3 +51,25 @@ def test_surface_points_project_onto_their_depth():
     points = surface_points(depth[:1], cameras[0])
     _, z = cameras[0].project(points)
     torch.testing.assert_close(z[0], depth[0][depth[0].isfinite()].double())
+
+
+def test_mirrored_depth_stays_with_its_pixels():
+    capture = training_capture("llff", 3, 2, 16, with_depth=True)
+    assert torch.equal(mirrored(capture).inverse_depth, capture.inverse_depth.flip(-1))
+
+
+def test_depth_is_in_the_unit_of_the_normalised_cameras():
+    """A place that one view sees is at the other one's depth, where both see it; the scene's own unit is another."""
+    capture = training_capture("dtu", 5, 3, 32, with_depth=True)
+    cameras, inverse = capture.cameras, capture.inverse_depth.double()
+    pixels, z = cameras.project(surface_points(1 / capture.inverse_depth[:1], cameras[0]))
+    for view in (1, 2):
+        inside = (z[view] > 0) & (pixels[view] >= 0).all(-1) & (pixels[view] < 32).all(-1)
+        x, y = pixels[view][inside].long().unbind(-1)
+        assert float((inverse[view][y, x] * z[view][inside] - 1).abs().median()) < 0.02
+
+
+def test_a_held_out_group_is_the_same_every_time():
+    (one, cameras), (same, again) = (held_out_group("llff", 1, 12, 4) for _ in range(2))
+    assert torch.equal(cameras.world_from_camera, again.world_from_camera)
+    assert torch.equal(one.image, same.image)

@@ -154,3 +154,28 @@ def test_errors_are_sentences():
         trace(Scene.stack([scene, scene]), small)
     with pytest.raises(ValueError, match="evenly"):
         render_views(Scene.stack([scene, scene]), small)
+
+
+def test_light_of_a_matte_surface_is_its_albedo_times_the_skys_share():
+    """Without a lamp and haze: (bias + tint * texture) * ambient * (0.7 + 0.3 n_z), in closed form."""
+    scene = one_object("sphere", (0.5,) * 3)
+    slot = int(scene.active[0].nonzero()[0, 0])
+    scene.bias[0, slot], scene.tint[0, slot] = torch.tensor([0.1, 0.2, 0.3]), torch.tensor([0.4, 0.2, -0.1])
+    plain = replace(
+        scene, textures=torch.full_like(scene.textures, 0.5), gloss=torch.zeros_like(scene.gloss),
+        haze_distance=torch.full_like(scene.haze_distance, 1e12), light_colour=torch.zeros_like(scene.light_colour),
+    )  # fmt: skip
+    out = trace(plain, camera((2.0, 0.4, 0.9), (0.1, -0.2, 0.3), fov=0.2), supersample=1)
+    assert out.depth.isfinite().all()
+    albedo = torch.tensor([0.3, 0.3, 0.25])
+    expected = (albedo * scene.ambient[0])[:, None, None] * (0.7 + 0.3 * out.normal[0, 2])
+    torch.testing.assert_close(out.image[0], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_disc_is_clear_of_footprints_that_it_does_not_touch():
+    builder = SceneBuilder("dtu", 0, None, 32)
+    builder.add("cylinder", (1.0, 2.0, 0.3), (0.3, 0.4, 0.3))  # footprint: a disc of radius 0.5
+    assert builder.clear_of_others(1.0, 3.01, 0.5)
+    assert not builder.clear_of_others(1.0, 2.99, 0.5)
+    assert not builder.clear_of_others(0.01, 2.0, 0.5)
+    assert builder.clear_of_others(-1.0, 2.0, 0.5)

@@ -143,3 +143,11 @@ def test_without_compiler_the_reference_runs_with_one_warning(tmp_path: Path) ->
     )
     environment = {**os.environ, "CXX": "no-such-compiler", "CAT3D_CACHE": str(tmp_path)}
     subprocess.run([sys.executable, "-c", code], check=True, env=environment, cwd=Path(__file__).resolve().parents[3])
+
+
+def test_a_level_is_hashed_where_its_cube_does_not_fit_its_own_rows():
+    """11^3 = 1331 cells fit 2^13 rows; 22^3 = 10648 do not, though they fit what stands before and after together."""
+    layout = make_layout(11, 22, 13, 2)
+    assert layout.offsets == (0, 1331, 1331 + 8192)
+    assert [layout.hashed(level) for level in range(2)] == [False, True]
+    assert not make_layout(16, 16, 12, 2).hashed(0)  # exactly as many

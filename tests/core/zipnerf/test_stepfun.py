@@ -110,3 +110,16 @@ def test_distortion_of_thin_bins_far_from_the_origin() -> None:
     w = torch.tensor([[0.0, 0.33191338, 0.43552593]])
     exact = stepfun.distortion(t.double(), w.double())
     torch.testing.assert_close(stepfun.distortion(t, w).double(), exact, rtol=1e-6, atol=0)
+
+
+def test_quantiles_are_where_the_running_sum_gets_there() -> None:
+    """Against a loop over edges in float64, with more batch axes than one."""
+    t, w = _histogram(6, 9, seed=4)
+    found = stepfun.quantile(t.view(2, 3, 10), w.view(2, 3, 9), 0.3).flatten()
+    for row in range(6):
+        aim, bin_, below = 0.3 * float(w[row].sum()), 0, 0.0
+        while below + float(w[row, bin_]) < aim:
+            below += float(w[row, bin_])
+            bin_ += 1
+        share = (aim - below) / float(w[row, bin_])
+        assert float(found[row]) == pytest.approx(float(t[row, bin_] + share * (t[row, bin_ + 1] - t[row, bin_])))

@@ -340,3 +340,19 @@ def test_near_gradients_are_scaled_and_nothing_else_changes() -> None:
     t = torch.tensor([[0.0, 0.2, 3.0, 5.0]])
     scale = near_gradient_scale(t, torch.tensor([[0.0, 0.0, 2.0]]))
     assert scale[0].tolist() == pytest.approx([0.04, 1.0, 1.0])
+
+
+def test_an_empty_scene_shows_a_grey_between_the_backgrounds_levels() -> None:
+    """At random for each ray with a generator, half-way between the levels without one."""
+    config = dataclasses.replace(TINY, background=(0.2, 0.6), far=1e-6, near=0.0)  # too short to meet anything
+    rays = image_rays(_views().cameras, 0)
+    field = Field(TINY, seed=1)
+    with torch.no_grad():
+        plain = render_rays(field, rays, config=config)
+        drawn = render_rays(field, rays, config=config, generator=torch.Generator().manual_seed(0))
+    assert float(plain.opacity.max()) < 1e-3
+    torch.testing.assert_close(plain.rgb, torch.full_like(plain.rgb, 0.4), rtol=0, atol=1e-3)
+    assert float(drawn.rgb.min()) > 0.199
+    assert float(drawn.rgb.max()) < 0.601
+    assert float(drawn.rgb[:, 0].std()) == pytest.approx(0.4 / 12**0.5, rel=0.1)
+    assert float((drawn.rgb[:, 0] - drawn.rgb[:, 2]).abs().max()) < 1e-3
