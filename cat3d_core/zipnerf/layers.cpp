@@ -70,11 +70,11 @@ inline void multiply(V* out, const float* in, int stride, int inputs, const V* m
 }
 
 inline float total(const V& v) {
-    typedef float H __attribute__((vector_size(32)));
-    typedef float Q __attribute__((vector_size(16)));
-    const H h = __builtin_shufflevector(v, v, 0, 1, 2, 3, 4, 5, 6, 7) + __builtin_shufflevector(v, v, 8, 9, 10, 11, 12, 13, 14, 15);
-    const Q q = __builtin_shufflevector(h, h, 0, 1, 2, 3) + __builtin_shufflevector(h, h, 4, 5, 6, 7);
-    return (q[0] + q[1]) + (q[2] + q[3]);
+    typedef float H __attribute__((vector_size(2 * W)));
+    H parts[2];
+    std::memcpy(parts, &v, sizeof v);
+    const H h = parts[0] + parts[1];
+    return ((h[0] + h[4]) + (h[1] + h[5])) + ((h[2] + h[6]) + (h[3] + h[7]));
 }
 
 // The product for one or two outputs, by rows of the weights: elsewhere most of an output vector would be idle.

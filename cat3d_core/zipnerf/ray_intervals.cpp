@@ -90,7 +90,7 @@ extern "C" int weights_forward(const float* density, const float* lengths, float
 #pragma omp parallel for num_threads(threads) schedule(static)
     for (int64_t ray = 0; ray < rays; ++ray) {
         const int64_t at = ray * count;
-        float depth[MOST], before[MOST + 1], alpha[MOST];
+        float depth[MOST], before[MOST + 1], alpha[MOST] = {};
         before[0] = 0.f;
         for (int i = 0; i < count; ++i) {
             depth[i] = density[at + i] * lengths[at + i];
