@@ -161,7 +161,8 @@ def _decay_inputs(draw: Draw) -> tuple[Tensor, ...]:
 
 
 def _decay(rows: Tensor) -> Tensor:
-    """The decay's share of the gradient, over two groups of rows; gradients are zero otherwise."""
+    """The decay's share of the gradient, over two groups of rows; gradients are zero otherwise. Read off the first
+    moment, a tenth of it: below 1e-36 that is no normal number any more."""
     parameter = rows.clone().requires_grad_()
     parameter.grad = torch.zeros_like(rows)
     adam = Adam({"x": parameter}, {"x": [(0, 3, _DECAY), (3, 8, 2 * _DECAY)]}, _BETA1, _BETA2, _TINY)
@@ -203,6 +204,6 @@ ROUTINES = [
     ),
     Routine(
         "adam.Adam[decay]", "normalised decay of groups of rows", _decay_inputs, each(_decay), _decay_reference,
-        {SINGLE: 2e-7}, share=0.1,
+        {SINGLE: 2e-7}, share=0.1, floor=1e-36,
     ),
 ]  # fmt: skip
