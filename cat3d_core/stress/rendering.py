@@ -207,34 +207,28 @@ def _chain(rows: Tensor) -> Tensor:
     return out.view(-1, _GROUP, _WIDTHS[3])
 
 
-def _chain_steps(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """The answer in float64 and the size of the sums that it is made of."""
-    x, size = rows, rows.detach().abs()
+def _chain_steps(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The answer in float64, the size of the sums that it is made of, and whether a case has one near a bend."""
+    x, size, bent = rows, rows.detach().abs(), torch.zeros(len(rows), dtype=torch.bool)
     for weight, added, relu in _layers(len(rows), torch.float64):
         own = added.expand(len(rows), -1)[:, None]
         x = (x[..., None, :] * weight).sum(-1) + own
         size = (size[..., None, :] * weight.abs()).sum(-1) + own.abs()
+        bent |= (relu & (x.detach().abs() < 1e-5 * size)).flatten(1).any(1)
         x = x.clamp(min=0) if relu else x
-    return x, size
+    return x, size, bent
 
 
 def _chain_reference(rows: Tensor) -> Exact:
-    return Exact(*_chain_steps(rows))
+    return Exact(*_chain_steps(rows)[:2])
 
 
 def _chain_slope(rows: Tensor) -> tuple[Tensor]:
     """The products of all weights. Near a bend, within rounding, either slope is right: such cases say nothing."""
     slope = torch.ones(1, 1, dtype=torch.float64)
-    bent = torch.zeros(len(rows), dtype=torch.bool)
-    x, size = rows, rows.abs()
-    for weight, added, relu in _layers(len(rows), torch.float64):
-        own = added.expand(len(rows), -1)[:, None]
-        x = (x[..., None, :] * weight).sum(-1) + own
-        size = (size[..., None, :] * weight.abs()).sum(-1) + own.abs()
-        bent |= (relu & (x.abs() < 1e-5 * size)).flatten(1).any(1)
-        x = x.clamp(min=0) if relu else x
+    for weight, _, _ in _layers(len(rows), torch.float64):
         slope = weight.abs() @ slope.expand(weight.shape[1], -1)
-    return (torch.where(bent, torch.inf, float(slope.sum())),)
+    return (torch.where(_chain_steps(rows)[2], torch.inf, float(slope.sum())),)
 
 
 def _encode_reference(d: Tensor) -> Exact:

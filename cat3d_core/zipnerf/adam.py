@@ -43,6 +43,8 @@ class Adam:
         the answer is False: a gradient beyond 1e19 would freeze its parameter with an infinite second moment."""
         eps = self.eps
         live = {name: p for name, p in self.parameters.items() if p.grad is not None}
+        if not live:
+            return True
         gradients = [p.grad for p in live.values() if p.grad is not None]
         tensors = [*live.values(), *gradients, *(self.mean[name] for name in live)]
         plain = all(x.dtype == torch.float32 and x.device.type == "cpu" and x.is_contiguous() for x in tensors)

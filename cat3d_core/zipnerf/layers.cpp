@@ -6,6 +6,7 @@
 #include <cstdint>
 #include <cstring>
 #include <omp.h>
+#include <type_traits>
 #include <vector>
 
 namespace {
@@ -56,17 +57,38 @@ void with_vectors(int count, Use use) {
     else use(std::integral_constant<int, 4>());
 }
 
-// out[r] += sum over i of in[r][i] * matrix[i], for R rows of N vectors.
-template <int N, int R>
-inline void multiply(V* out, const float* in, int stride, int inputs, const V* matrix) {
-    V sum[R][N];
-    for (int r = 0; r < R; ++r)
-        for (int n = 0; n < N; ++n) sum[r][n] = out[r * N + n];
-    for (int i = 0; i < inputs; ++i)
-        for (int r = 0; r < R; ++r)
-            for (int n = 0; n < N; ++n) sum[r][n] += in[r * stride + i] * matrix[i * N + n];
-    for (int r = 0; r < R; ++r)
-        for (int n = 0; n < N; ++n) out[r * N + n] = sum[r][n];
+// out[a] += the sum over k of left[a * next + k * along] * right[k], for A sums of N vectors: a tile stays in registers.
+template <int N, int A>
+inline void product_tile(V* out, const float* left, int next, int along, int terms, const V* right) {
+    V sum[A][N];
+    for (int a = 0; a < A; ++a)
+        for (int n = 0; n < N; ++n) sum[a][n] = out[a * N + n];
+    for (int k = 0; k < terms; ++k)
+        for (int a = 0; a < A; ++a)
+            for (int n = 0; n < N; ++n) sum[a][n] += left[a * next + k * along] * right[k * N + n];
+    for (int a = 0; a < A; ++a)
+        for (int n = 0; n < N; ++n) out[a * N + n] = sum[a][n];
+}
+
+// The same for any number of sums, `width` numbers wide.
+void product(V* out, int count, int width, const V* left, int next, int along, int terms, const V* right) {
+    with_vectors(vectors(width), [&](auto constant) {
+        constexpr int N = constant, A = N == 1 ? 12 : N == 2 ? 8 : N == 3 ? 8 : 5;
+        const float* from = (const float*)left;
+        int a = 0;
+        for (; a + A <= count; a += A) product_tile<N, A>(out + a * N, from + a * next, next, along, terms, right);
+        for (; a < count; ++a) product_tile<N, 1>(out + a * N, from + a * next, next, along, terms, right);
+    });
+}
+
+// out[r] += in[r] * matrix, for `rows` rows of `inputs` numbers.
+void multiply_rows(V* out, int outputs, const V* in, int inputs, const V* matrix, int rows) {
+    product(out, rows, outputs, in, vectors(inputs) * W, 1, inputs, matrix);
+}
+
+// sum[j] += over the rows r of left[r][j] * right[r].
+void outer_rows(V* sum, const V* left, int outputs, const V* right, int inputs, int rows) {
+    product(sum, outputs, inputs, left, 1, vectors(outputs) * W, rows, right);
 }
 
 inline float total(const V& v) {
@@ -88,41 +110,6 @@ void multiply_few(V* out, int outputs, const V* in, int inputs, const V* weights
             for (int i = 0; i < left; ++i) value += in[r * count + count - 1][i] * weights[j * count + count - 1][i];
             out[r][j] += value;
         }
-}
-
-void multiply_rows(V* out, int outputs, const V* in, int inputs, const V* matrix, int rows) {
-    with_vectors(vectors(outputs), [&](auto constant) {
-        constexpr int N = constant, R = N == 1 ? 12 : N == 2 ? 8 : N == 3 ? 6 : 5;
-        const int stride = vectors(inputs) * W;
-        const float* from = (const float*)in;
-        int r = 0;
-        for (; r + R <= rows; r += R) multiply<N, R>(out + r * N, from + r * stride, stride, inputs, matrix);
-        for (; r < rows; ++r) multiply<N, 1>(out + r * N, from + r * stride, stride, inputs, matrix);
-    });
-}
-
-// sum[j] += over the rows r of left[r][j] * right[r], for J numbers of `left` and N vectors of `right`.
-template <int N, int J>
-inline void outer(V* sum, const float* left, int stride, const V* right, int rows) {
-    V tile[J][N];
-    for (int j = 0; j < J; ++j)
-        for (int n = 0; n < N; ++n) tile[j][n] = sum[j * N + n];
-    for (int r = 0; r < rows; ++r)
-        for (int j = 0; j < J; ++j)
-            for (int n = 0; n < N; ++n) tile[j][n] += left[r * stride + j] * right[r * N + n];
-    for (int j = 0; j < J; ++j)
-        for (int n = 0; n < N; ++n) sum[j * N + n] = tile[j][n];
-}
-
-void outer_rows(V* sum, const V* left, int outputs, const V* right, int inputs, int rows) {
-    with_vectors(vectors(inputs), [&](auto constant) {
-        constexpr int N = constant, J = N == 1 ? 16 : N == 4 ? 6 : 8;
-        const int stride = vectors(outputs) * W;
-        const float* from = (const float*)left;
-        int j = 0;
-        for (; j + J <= outputs; j += J) outer<N, J>(sum + j * N, from + j, stride, right, rows);
-        for (; j < outputs; ++j) outer<N, 1>(sum + j * N, from + j, stride, right, rows);
-    });
 }
 
 struct Layer {
@@ -266,7 +253,8 @@ extern "C" int chain_backward(const float* in, int count, const int64_t* shape, 
                     if (l == count - 1) std::fill_n(slope, n * wide, V{});
                     if (gradients[l]) {
                         load(given.data(), gradients[l] + first * layer.outputs, n, layer.outputs);
-                        fetch(gradients[l] + (first + n) * layer.outputs, std::min<int64_t>(CHUNK, rows - first - n) * layer.outputs);
+                        const int64_t next = first + n;
+                        fetch(gradients[l] + next * layer.outputs, std::min<int64_t>(CHUNK, rows - next) * layer.outputs);
                         for (int i = 0; i < n * wide; ++i) slope[i] += given[i];
                     }
                     if (layer.relu)

@@ -45,7 +45,7 @@ inline int locate(const double* knots, int count, double x, int from) {
 
 // t (R, bins + 1), logits (R, bins), u (R, count), or (count) for all rays -> out (R, count + 1): see
 // stepfun.sample_intervals.
-extern "C" int sample_intervals(const float* t, const float* logits, const float* u, int u_stride, float* out, int64_t rays,
+extern "C" int sample_intervals(const float* t, const float* logits, const float* u, float* out, int64_t rays, int u_stride,
                                 int bins, int count, int threads) {
     if (bins > MOST || count > MOST || count < 2) return 1;
 #pragma omp parallel for num_threads(threads) schedule(static)

@@ -1,7 +1,7 @@
 """What happens along rays, by the fastest way there is: the C++ kernels of ray_intervals.cpp, or plain torch.
 
-Each function here has its formula in another module, which is its reference: `stepfun`, `render.weights_from_density`
-and `losses`. The kernels are for float32 on the CPU and rays of at most 128 intervals.
+Each function has a reference in torch, here (`..._reference`) or in `stepfun`. The kernels are for float32 on the CPU
+and rays of at most 128 intervals.
 """
 
 from __future__ import annotations
@@ -40,11 +40,8 @@ def sample_intervals(t: Tensor, logits: Tensor, count: int, generator: torch.Gen
         return stepfun.sample_intervals(t, logits, count, generator)
     u = stepfun.stratified(t, count, generator)
     t, logits, out = t.contiguous(), logits.contiguous(), t.new_empty((len(t), count + 1))
-    kernels.sample_intervals(
-        pointer(t), pointer(logits), pointer(u), ctypes.c_int(0 if u.ndim == 1 else count), pointer(out),
-        ctypes.c_int64(len(t)), ctypes.c_int(logits.shape[1]), ctypes.c_int(count),
-        ctypes.c_int(torch.get_num_threads()),
-    )  # fmt: skip
+    stride = 0 if u.ndim == 1 else count
+    _call(kernels.sample_intervals, t, logits, u, out, rays=len(t), counts=(stride, logits.shape[1], count))
     return out
 
 

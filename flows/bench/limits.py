@@ -80,7 +80,9 @@ def _rounded(size: float) -> int:
     return int(min(MOST_BYTES, max(LEAST_BYTES, 2 ** math.ceil(math.log2(max(1.0, size))))))
 
 
-def _best(run: Callable[[], Any], clock: Clock, device: str, times: int = 1, repeats: int = REPEATS) -> float:
+def best_seconds(
+    run: Callable[[], Any], clock: Clock = "wall", device: str = "cpu", times: int = 1, repeats: int = REPEATS
+) -> float:
     """Seconds of one of `times` runs in a row, the best of `repeats` rows."""
     now, found = CLOCKS[clock], []
     for _ in range(repeats + 1):  # the first warms up
@@ -101,7 +103,7 @@ def peak_flops(dtype: torch.dtype, device: str, threads: int, clock: Clock) -> f
         square = torch.ones((side, side), dtype=dtype, device=device)
         out = torch.empty_like(square)
         product = functools.partial(torch.mm, square, square, out=out)
-        best = max(best, 2 * side**3 / _best(product, clock, device, repeats=repeats))
+        best = max(best, 2 * side**3 / best_seconds(product, clock, device, repeats=repeats))
     return best
 
 
@@ -114,7 +116,7 @@ def peak_bytes(size: int, device: str, threads: int, clock: Clock) -> float:
     times = max(1, ROW_BYTES // size)
     # On a busy machine a row is often interrupted: the shorter it is, the more of them.
     many = max(REPEATS, min(8 * REPEATS, MOST_BYTES // (times * size)))
-    copy, total = (_best(run, clock, device, times, many) for run in (lambda: target.copy_(half), source.sum))
+    copy, total = (best_seconds(run, clock, device, times, many) for run in (lambda: target.copy_(half), source.sum))
     return size / min(copy, total)
 
 

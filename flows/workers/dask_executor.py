@@ -262,7 +262,8 @@ def _answer(number: int, future: distributed.Future) -> Answer:
     if error is None or isinstance(error, (KilledWorker, *UNREACHED)):
         return Answer(number=number, died=f"of the Dask cluster was lost ({error or future.status})")
     # What fails in the work itself comes back in an answer: this is about the worker.
-    text = (
+    message = (
         f"A worker of the Dask cluster cannot work ({type(error).__name__}: {error}). It needs cat3d and the Prefect "
+        "server at PREFECT_API_URL."
     )
-    return Answer(number=number, error="WorkerError", message=f"{text}server at PREFECT_API_URL.")
+    return Answer(number=number, error="WorkerError", message=message)

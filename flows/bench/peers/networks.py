@@ -9,7 +9,6 @@ from __future__ import annotations
 from flows.bench.peers.task import Row, Task, answer
 
 # isort: split
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -50,21 +49,12 @@ def measure(task: Task) -> list[Row]:
     with torch.no_grad():
         for who, (network, run) in runs.items():
             work = limits.Work(counted(run), network_bytes(network) + 2 * flat.numel() * flat.element_size())
-            seconds = _best(run, repeats)
+            seconds = limits.best_seconds(run, repeats=repeats)
             rows.append(
                 {"who": who, "setting": f"{sum(p.numel() for p in network.parameters()) / 1e6:.1f} M parameters",
                  "seconds": seconds / (groups * views), **limits.columns(work, seconds)}
             )  # fmt: skip
     return rows
-
-
-def _best(run: Callable[[], Any], repeats: int) -> float:
-    times = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - started)
-    return min(times)
 
 
 if __name__ == "__main__":
