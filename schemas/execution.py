@@ -26,6 +26,8 @@ class ExecutionConfig(StrictModel):
     """A worker that finishes nothing and gives no sign of life for so long is given up, its work handed to another."""
     attempts: PositiveInt = 3
     """Workers that may die on one and the same group or stage before the stage fails."""
+    checkpoint_s: PositiveFloat = 20.0
+    """Between two saved states of a reconstruction under way, in seconds: what a lost worker costs at most."""
     dask_address: str | None = None
     """Scheduler of a running Dask cluster, e.g. tcp://10.0.0.1:8786."""
     dask_cluster: str | None = None

@@ -19,7 +19,6 @@ from flows.stages.training_views import enough, training_views
 from schemas.decisions import Decision, skipped
 from schemas.scene_store import SceneStore
 
-CHECKPOINT_INTERVAL_S = 20.0
 #: A row of the training record at every so many steps.
 RECORD_EVERY = 10
 
@@ -51,15 +50,18 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     first = reconstructor.iteration
     if first:
         decisions.append(skipped(f"Went on from the checkpoint at iteration {first}.", steps=first))
-    record, rays = _train(reconstructor, checkpoint, f"reconstruct {job.scene_id} {job.run}")
+    pause = job.config.execution.checkpoint_s
+    record, rays = _train(reconstructor, checkpoint, pause, f"reconstruct {job.scene_id} {job.run}")
     decisions += [Decision(**vars(decision)) for decision in reconstructor.decisions()]
     write_reconstruction(run, job.config.reconstruct.method, reconstructor, record)
     checkpoint.remove()
     return Outcome({"views": len(views), "steps": reconstructor.iteration - first, "rays": rays}, decisions)
 
 
-def _train(reconstructor: Reconstructor, checkpoint: Checkpoint, title: str) -> tuple[list[list[float]], float]:
-    """All steps that are left; the rows of the training record, and the rays that were cast."""
+def _train(
+    reconstructor: Reconstructor, checkpoint: Checkpoint, pause: float, title: str
+) -> tuple[list[list[float]], float]:
+    """All steps that are left, saved every `pause` seconds; the rows of the training record, and the rays cast."""
     record, rays = [], 0.0
     saved = started = time.monotonic()
     with meter(title, reconstructor.iterations) as progress:
@@ -70,7 +72,7 @@ def _train(reconstructor: Reconstructor, checkpoint: Checkpoint, title: str) -> 
             if reconstructor.iteration % RECORD_EVERY == 0 or reconstructor.finished:
                 record.append([reconstructor.iteration, time.monotonic() - started, loss, psnr])
             progress.update(reconstructor.iteration, f"{psnr:.1f} dB" if "psnr" in step else "")
-            if time.monotonic() - saved > CHECKPOINT_INTERVAL_S:
+            if time.monotonic() - saved > pause:
                 checkpoint.save(reconstructor.state())
                 saved = time.monotonic()
     return record, rays

@@ -83,7 +83,7 @@ def test_a_sweep_gives_one_table_with_one_and_two_processes_and_on_dask(tmp_path
 @pytest.mark.slow
 def test_a_lost_workers_reconstruction_goes_on_from_its_last_state(tmp_path: Path, prefect_url: str) -> None:
     """The worker is killed once it has saved a state; the other one takes the stage over, with an equal field."""
-    long = {"reconstruct": {"overrides": TRAINER | {"iterations": 6000}}, "skip": {"plateau": False}}
+    long = {"reconstruct": {"overrides": TRAINER | {"iterations": 2000}}, "skip": {"plateau": False}}
     out, killed = tmp_path / "out", list[int]()
 
     def strike() -> None:
@@ -95,7 +95,7 @@ def test_a_lost_workers_reconstruction_goes_on_from_its_last_state(tmp_path: Pat
 
     threading.Thread(target=strike, daemon=True).start()
     methods = {"long": long, "short": {"method": "zipnerf"}}
-    struck = swept(out, SOURCE, methods=methods, workers=2)
+    struck = swept(out, SOURCE, methods=methods, workers=2, checkpoint_s=0.5)
     assert killed
     record = SceneStore.open(out / "procedural_llff_2.zarr").record("reconstruct", "v3-long")
     assert record is not None
