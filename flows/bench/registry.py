@@ -284,11 +284,12 @@ BENCHES: dict[str, Bench] = {
         ),
     ),
     "size": Bench(
-        "seconds and peak memory of a whole run by the number and size of the photos, as phones make them",
+        "seconds and peak memory of a whole run by the number and size of the photos, as phones make them; with peers "
+        "nerfacto's beside them",
         size_rows,
         (
-            Panel("Seconds by the number of photos", "photos", "cpu_seconds", ("megapixels",)),
-            Panel("Memory by the number of photos", "photos", "peak_gb", ("megapixels",)),
+            Panel("Seconds by the number of photos", "photos", "seconds", ("who", "megapixels")),
+            Panel("Memory by the number of photos", "photos", "peak_gb", ("who", "megapixels")),
         ),
     ),
     "synthetic": Bench("procedural scenes rendered: views a second per family", synthetic_rows),

@@ -1,4 +1,5 @@
-"""Seconds and peak memory against the number of photos and their size: `cat3d run` on photos as phones make them.
+"""Seconds and peak memory against the number of photos and their size: `cat3d run` on photos as phones make them, and
+nerfacto begun on the same photos where the peers are installed.
 
 The photos show a painted wall from an arc of cameras in front of it, exactly, so that thousands of them cost little:
 what is measured does not depend on what they show.
@@ -23,6 +24,9 @@ from torch.nn import functional
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.rays import image_rays
+from flows.bench.peers import compare
+from flows.bench.peers.task import Task
+from flows.bench.rows import MissingError
 from flows.exports.dataset import write_transforms
 from flows.media.images import write_jpeg
 from schemas.tables import TIMINGS, read_rows
@@ -33,6 +37,8 @@ SIZES = {1: (1152, 864), 4: (2320, 1740), 12: (4000, 3000)}
 COARSE = 4
 FOCAL = 0.8
 GRAIN = 4.0
+#: More memory than this nerfacto is not given, so that a machine of 16 GB survives it.
+PEER_GIGABYTES = 10.0
 
 
 def phone_photos(folder: Path, count: int, width: int, height: int) -> None:
@@ -61,14 +67,27 @@ def size_rows(quick: bool, data: Path | None) -> list[dict[str, Any]]:
 
 def rows(counts: Sequence[int], megapixels: Sequence[int], preset: str = "tiny") -> list[dict[str, Any]]:
     """A row for each number and size: seconds and peak memory (bytes of the largest process) of `cat3d run`, and of its
-    stages those that took longest."""
+    stages those that took longest. With the peers a second one: seconds until nerfacto trains, and what it holds."""
     found = []
     for count in counts:
         for size in megapixels:
             with tempfile.TemporaryDirectory(prefix="cat3d-size-") as folder:
                 phone_photos(Path(folder) / "photos", count, *SIZES[size])
-                found.append({"photos": count, "megapixels": size, "preset": preset, **run(Path(folder), preset)})
+                what = {"photos": count, "megapixels": size}
+                found.append({"who": "cat3d", **what, "preset": preset, **run(Path(folder), preset)})
+                found += [{"who": "nerfacto", **what, **row} for row in nerfacto(Path(folder) / "photos")]
     return found
+
+
+def nerfacto(photos: Path) -> list[dict[str, Any]]:
+    """nerfacto's first steps on a folder of photos, by nerfstudio's own reader; nothing without the peers."""
+    try:
+        python = compare.interpreter()
+    except MissingError:
+        return []
+    settings = {"photos": str(photos), "rays": compare.RAYS, "steps": 2, "gigabytes": PEER_GIGABYTES}
+    rows = compare.measure(python, "nerfacto_size", Task(settings | {"threads": torch.get_num_threads()}, {}))
+    return [{"seconds": r.pop("load_seconds"), "peak_gb": r.pop("peak_mb") / 1e3, **r} for r in rows]
 
 
 def run(folder: Path, preset: str) -> dict[str, Any]:
