@@ -35,7 +35,7 @@ RAYS = 512
 
 
 def rows(quick: bool, data: Path | None) -> list[Row]:
-    """Every part. In full nerfacto trains for four minutes a scene; with `data` poses are compared too."""
+    """Every part. In full nerfacto trains for two minutes a scene; with `data` poses are compared too."""
     interpreter()
     threads = torch.get_num_threads()
     found = metric_rows(2 if quick else 4, 378, 504, 2 if quick else 5, threads)
@@ -46,7 +46,7 @@ def rows(quick: bool, data: Path | None) -> list[Row]:
         scenes = scenes_of(data, ["strecha_fountain_P11"] if quick else list(poses.SCENES))
         found += pose_rows(scenes, 11 if quick else 20, threads)
     families, views, presets = (FAMILIES[:1], (9,), PRESETS[:1]) if quick else (FAMILIES, VIEWS, PRESETS)
-    size, seconds = (32, 40.0) if quick else (64, 240.0)
+    size, seconds = (32, 40.0) if quick else (64, 120.0)
     found += reconstruction_rows(families, views, size, seconds, presets, threads)
     return marked(found, {"who": "cat3d"})
 
