@@ -27,6 +27,8 @@ class SweepConfig:
     target_planes: int = 32
     #: Hypotheses that are left for the fine stage and for colours.
     hypotheses: int = 6
+    #: By how much the scores of hypotheses, and of photos, are multiplied before colours are blended by them.
+    sharpness: tuple[float, float] = (1.0, 1.0)
     #: Widths of the 3D U-Nets at 1/4, 1/8 and 1/16.
     volume: tuple[int, int, int] = (16, 32, 64)
     #: Widths of the finishing U-Net at full size, 1/2, 1/4 and 1/8.

@@ -88,7 +88,9 @@ class SweepNetwork(nn.Module):
         at = project(maps, share * most.view(-1, 1, 1, 1))
         colours = take(observed.image[photos.flatten()], at.grid.flatten(0, 1)).unflatten(0, photos.shape)
         trust = resized(trust, height, width)
-        blend = trust.masked_fill(~at.valid, -20.0).softmax(1) * probability[:, None]  # (N, M, K, H, W)
+        sharp, sharp_trust = self.config.sharpness
+        chosen = (trust * sharp_trust).masked_fill(~at.valid, -20.0 * sharp_trust).softmax(1)
+        blend = chosen * (logits * sharp).softmax(1)[:, None]  # (N, M, K, H, W)
         by_photo = (colours * blend[:, :, None]).sum(3)
         weight = blend.sum(2)
         blended = by_photo.sum(1)

@@ -56,8 +56,8 @@ def chosen_config(request: ReconstructionRequest) -> ZipNerfConfig:
     config = PRESETS[request.preset]
     if not request.generated:
         # The paper's baseline has no perceptual loss: captured views agree with each other. (Measured on llff_fern, 3
-        # views, 101x76, 300 iterations of `fast`: 24.7 dB without, 18.9 dB with.)
-        config = dataclasses.replace(config, lpips_weight=0.0)
+        # views, 101x76, 300 iterations of `fast`: 24.7 dB without, 18.9 dB with.) Its views come without depths.
+        config = dataclasses.replace(config, lpips_weight=0.0, depth_prior=0.0)
     elif request.dataset in STRONG_LPIPS_DATASETS:
         config = dataclasses.replace(config, lpips_weight=STRONG_LPIPS * config.lpips_weight)
     iterations = request.overrides.get("iterations", config.iterations)

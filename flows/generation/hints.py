@@ -15,6 +15,7 @@ from cat3d_core.weights import default_sweep_path
 from flows.errors import InputError
 from flows.jobs.device import device
 from flows.jobs.job import Job
+from schemas.content_key import content_key
 from schemas.scene_store import Run
 
 #: A view is explained where all but this share of its pixels are the photos' own by at least `OWN`.
@@ -35,7 +36,7 @@ class StoredHint(NamedTuple):
 
 
 def sweep_identity(job: Job) -> str:
-    """The hash of the job's plane sweep. Raises InputError for a file that is none."""
+    """The hash of the job's plane sweep: its weights, and how it blends. Raises InputError for a file that is none."""
     path = _path(job)
     return _identity(path, path.stat().st_mtime_ns)
 
@@ -76,7 +77,8 @@ def _path(job: Job) -> Path:
 @functools.lru_cache(maxsize=4)
 def _identity(path: Path, _changed: int) -> str:
     try:
-        return str(describe_sweep(path)["sha256"])
+        known = describe_sweep(path)
+        return content_key(**{name: known[name] for name in ("sha256", "config", "composite")})
     except ValueError as error:
         raise InputError(f"hints.checkpoint: {error}") from None
 

@@ -8,16 +8,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from cat3d_core.cameras import Cameras
 from cat3d_core.matching.hint import Hint, hint, observe
 from cat3d_core.matching.network import SweepNetwork
-from cat3d_core.sample_sets import KINDS, sample_cameras
+from cat3d_core.sample_sets import KINDS
 from flows.generation.groups import view_keys
 from flows.generation.hints import OWN, UNEXPLAINED_SHARE, open_sweep, read_hint, sweep_identity
 from flows.generation.imported import samples
+from flows.generation.photo_depths import photos
 from flows.generation.plan import read_plan
-from flows.generation.views import captured_sample
-from flows.jobs.access import read_cameras, views_with_role
+from flows.jobs.access import views_with_role
 from flows.jobs.device import cpu_threads
 from flows.jobs.job import Job, Outcome
 from flows.jobs.needs import Needs
@@ -25,7 +24,7 @@ from flows.jobs.stage import Stage
 from flows.media.images import to_uint8
 from flows.progress import meter
 from schemas.decisions import chosen, skipped
-from schemas.scene_store import Run, SceneStore, Section
+from schemas.scene_store import SceneStore, Section
 
 #: Views that are worked on together, and stored together.
 AT_ONCE = 8
@@ -43,6 +42,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
     """Write `hints/`, each view recorded in `done` when it is complete; only missing ones are made."""
     run = store.run(job.run)
     plan = read_plan(run.plan, store.captured.shape("size")[0])
+    train = views_with_role(store, run, "train")
     section = run.section("hints", create=True)
     count, side = len(plan), int(plan.cameras.size[0, 0])
     section.create_array("colour", (count, side, side, 3))
@@ -60,7 +60,7 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
             if not views:
                 continue
             network = open_sweep(job)
-            observed = observe(network, *photos(store, run, kind, side))
+            observed = observe(network, *photos(store, train, kind, side))
             for first in range(0, len(views), AT_ONCE):
                 some = views[first : first + AT_ONCE]
                 _store(section, some, hint(network, observed, plan.cameras[some]), keys)
@@ -84,13 +84,6 @@ def execute(job: Job, store: SceneStore, key: str) -> Outcome:
         )
         decisions.append(skipped(text, "explained", views=int(explained.sum())))
     return Outcome({"views": made}, decisions)
-
-
-def photos(store: SceneStore, run: Run, kind: str, side: int) -> tuple[torch.Tensor, Cameras]:
-    """The training views' square samples (M, 3, side, side) in [0, 1], and their cameras."""
-    train = views_with_role(store, run, "train")
-    cameras = sample_cameras(read_cameras(store.captured, train), kind, side)
-    return torch.stack([captured_sample(store, view, kind, side) for view in train]), cameras
 
 
 def shows(network: SweepNetwork, confidence: torch.Tensor) -> bool:

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from cat3d_core.reconstruction import Reconstructor
+from flows.generation.hints import sweep_identity
 from flows.jobs.device import exact_device
 from flows.jobs.job import Job, Outcome
 from flows.jobs.needs import Needs
@@ -32,6 +33,8 @@ def inputs(job: Job, keys: Mapping[str, str]) -> dict[str, Any]:
     found: dict[str, Any] = {"train": train, "detail": skip.detail, "seen": bound or skip.seen}
     if job.generates and skip.seen and job.capture().mask_training:
         found["masks"] = True  # the brief field heeds them
+    if job.hinted:
+        found["depths"] = sweep_identity(job)
     return found | dict(open_reconstructor(job).settings)
 
 

@@ -12,6 +12,7 @@ from torch.nn import functional
 from cat3d_core.cameras import Cameras
 from cat3d_core.reconstruction import Views
 from flows.generation.brief import LEAST, shown_by_captured
+from flows.generation.photo_depths import photo_depths
 from flows.generation.views import GeneratedView, generated_views
 from flows.jobs.access import read_cameras, read_images, read_masks, views_with_role
 from flows.jobs.job import Job
@@ -60,7 +61,10 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
     if masks is not None:
         masks += [None] * (len(cameras) - len(train))
         decisions.append(skipped("Pixels outside the masks of captured views were not trained on."))
-    maps = hint_maps(len(train), made)
+    depths = photo_depths(job, store, train) if made and job.hinted else []
+    if depths:
+        decisions.append(chosen("The plane sweep's depths of captured and generated views guide the training."))
+    maps = hint_maps(len(train), made, depths)
     images = chain(read_images(store.captured, train), (view.image for view in made))
     views = Views.from_images(cameras, images, captured, masks, **maps)
     kept, told = unseen(job, views)
@@ -73,16 +77,19 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
     return alone, [*decisions, told]
 
 
-def hint_maps(captured: int, made: Sequence[GeneratedView]) -> dict[str, list[torch.Tensor | None]]:
-    """The trust in each pixel of generated views, and their depths, as `Views.from_images` takes them; captured views
-    are trusted wholly, and have none."""
-    if not any(view.trust is not None for view in made):
+def hint_maps(
+    captured: int, made: Sequence[GeneratedView], depths: Sequence[tuple[torch.Tensor, torch.Tensor]]
+) -> dict[str, list[torch.Tensor | None]]:
+    """The trust in each pixel of generated views, and the depths of all, as `Views.from_images` takes them; captured
+    views are trusted wholly. depths: of captured views, with the trust in them; none: not known."""
+    if not depths and not any(view.trust is not None for view in made):
         return {}
     none: list[torch.Tensor | None] = [None] * captured
+    of_captured = [depth for depth, _ in depths] or none, [trust for _, trust in depths] or none
     return {
         "weights": none + [view.trust for view in made],
-        "depths": none + [view.depth for view in made],
-        "depth_weights": none + [view.depth_trust for view in made],
+        "depths": [*of_captured[0], *(view.depth for view in made)],
+        "depth_weights": [*of_captured[1], *(view.depth_trust for view in made)],
     }
 
 

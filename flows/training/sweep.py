@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import time
@@ -83,18 +84,21 @@ def train_sweep(config: SweepRunConfig, out: Path, own: Ranks, bank_only: bool =
 
 
 def starting_network(config: SweepRunConfig) -> SweepNetwork:
-    """A new network, or the weights of `start`. Raises ConfigError where those are of another network."""
+    """A new network, or the weights of `start`, whose blending alone `network` may change. Raises ConfigError where
+    those are of another network."""
+    torch.manual_seed(config.seed)
+    started = None if config.start is None else load_sweep(config.start)
+    known = SweepConfig() if started is None else started.config
     try:
-        wanted = SweepConfig.from_fields(config.network)
+        wanted = SweepConfig.from_fields(json.loads(known.to_json()) | config.network)
     except TypeError as error:
         raise ConfigError(f"network: {error}.") from None
-    torch.manual_seed(config.seed)
-    if config.start is None:
+    if started is None:
         return SweepNetwork(wanted)
-    network = load_sweep(config.start)
-    if config.network and network.config != wanted:
-        raise ConfigError(f"network: {config.start} holds another network ({network.config}).")
-    return network
+    if dataclasses.replace(wanted, sharpness=known.sharpness) != known:
+        raise ConfigError(f"network: {config.start} holds another network ({known}).")
+    started.config = wanted
+    return started
 
 
 def render_bank(config: SweepRunConfig, folder: Path, own: Ranks) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from cat3d_core.cameras import Cameras
 from cat3d_core.matching.checkpoint import describe_sweep, load_sweep, save_sweep
@@ -14,6 +16,7 @@ from cat3d_core.matching.composite import Composite
 from cat3d_core.matching.config import SweepConfig
 from cat3d_core.matching.hint import Hint, hint, observe, photo_depth
 from cat3d_core.matching.network import SweepNetwork, partners
+from cat3d_core.matching.warp import pair_maps, project, take, views
 from tests.core.strategies import orbit, random_similarity
 
 SMALL = SweepConfig(
@@ -89,6 +92,27 @@ def test_photos_have_a_depth_of_their_own(network: SweepNetwork) -> None:
     assert float(depth.min()) >= 0
     assert float(depth.max()) <= SMALL.nearest * 1.0001
     assert float(error.min()) >= 0
+
+
+def test_sharp_blending_takes_the_likeliest_hypothesis_alone(network: SweepNetwork) -> None:
+    """One photo: at the limit each pixel has the colour of one place of it, and no geometry changes."""
+    image = torch.randint(0, 2, (1, 3, 32, 32), generator=torch.Generator().manual_seed(2)).float()
+    image = functional.interpolate(image[..., ::8, ::8], (32, 32), mode="nearest")
+    cameras = scene(1)[1]
+    soft, sharp, found = network.config, dataclasses.replace(network.config, sharpness=(1e4, 1e4)), {}
+    for config in (soft, sharp):
+        network.config = config
+        observed = network.observe(image, views(cameras[[0]]), partners(views(cameras[[0]]).pose, 3))
+        found[config] = network(observed, torch.zeros(2, 1, dtype=torch.int64), views(cameras[[1, 2]]), 32, 32)
+    network.config = soft
+    likeliest = found[sharp].probability.argmax(1, keepdim=True)
+    at = project(pair_maps(views(cameras[[1, 2]]), views(cameras[[0, 0]])[:, None]),
+                 found[sharp].hypotheses.gather(1, likeliest))  # fmt: skip
+    expected = take(image.expand(2, -1, -1, -1), at.grid[:, 0])[:, :, 0]
+    torch.testing.assert_close(found[sharp].blended, expected, rtol=0, atol=1e-4)
+    assert float((found[soft].blended - expected).abs().mean()) > 0.02
+    for name in ("inverse_depth", "spread", "seen", "probability"):
+        assert torch.equal(getattr(found[sharp], name), getattr(found[soft], name))
 
 
 def test_what_does_not_fit_is_refused(network: SweepNetwork) -> None:

@@ -88,9 +88,12 @@ def test_views_are_photos_where_they_show_the_place_and_samples_elsewhere(tmp_pa
         assert torch.from_numpy(run.generated.read("confidence", [view])[0]).float() == pytest.approx(trust, abs=1e-3)
     made = list(generated_views(run))
     assert len(made) == VIEWS
-    views, _ = training_views(one, SceneStore.open(one.store_path), run)
+    views, decisions = training_views(one, SceneStore.open(one.store_path), run)
     assert views.weight is not None
     assert views.inverse_depth is not None
+    assert views.inverse_depth_weight is not None
+    assert float(views.map(views.inverse_depth_weight, 0).max()) > 0, "a captured view has a depth of its own"
+    assert any("depths of captured and generated views" in d.text for d in decisions)
     assert bool((views.map(views.weight, 0) == 1).all())  # a captured view is trusted wholly
     assert float(views.map(views.weight, 3).max()) < 1
 
