@@ -13,7 +13,7 @@ from cat3d_core.matching.layers import enlarge
 from cat3d_core.matching.network import Swept
 from cat3d_core.matching.photos import Observed
 from cat3d_core.matching.planes import position_of, soft_assignment
-from cat3d_core.matching.warp import Views, pair_maps, project, take
+from cat3d_core.matching.warp import Views, agreeing
 
 #: Weights of the terms of `losses`.
 WEIGHTS = {
@@ -21,8 +21,6 @@ WEIGHTS = {
 }  # fmt: skip
 # Mean absolute error of colour at which the confidence aimed at has fallen to 1 / e.
 _TOLERANCE = 0.06
-# Depths that differ by this share, plus this much inverse depth, are the same surface.
-_SAME = (0.04, 0.004)
 
 
 @dataclass(frozen=True)
@@ -48,13 +46,7 @@ class SweepBatch:
 
 def visible(batch: SweepBatch) -> Tensor:
     """(N, M, H, W) bool: whether each photo truly shows what the target's pixel shows."""
-    maps = pair_maps(batch.target, batch.views[batch.photos])
-    at = project(maps, batch.truth_depth[:, None])
-    n, m = batch.photos.shape
-    depth = batch.inverse_depth[batch.photos.flatten()][:, None]
-    there = take(depth, at.grid.flatten(0, 1), "nearest").unflatten(0, (n, m))[:, :, 0, 0]
-    here = at.inverse_depth[:, :, 0]
-    return at.valid[:, :, 0] & ((there - here).abs() < _SAME[0] * here + _SAME[1])
+    return agreeing(batch.truth_depth, batch.target, batch.inverse_depth, batch.views, batch.photos)
 
 
 def losses(out: Swept, observed: Observed, batch: SweepBatch, nearest: float) -> dict[str, Tensor]:

@@ -19,6 +19,8 @@ from cat3d_core.cameras import Cameras
 _FAR = 4.0
 # A point nearer to a photo's camera plane than this (times its depth in the target) is not seen by it.
 _BEHIND = 1e-3
+# Depths that differ by this share, plus this much inverse depth, are the same surface.
+_SAME = (0.04, 0.004)
 
 
 @dataclass(frozen=True)
@@ -107,3 +109,14 @@ def take(maps: Tensor, grid: Tensor, mode: str = "bilinear") -> Tensor:
     flat = grid.flatten(1, 2)
     out = F.grid_sample(maps.to(grid.dtype), flat, mode=mode, padding_mode="border", align_corners=False)
     return out.unflatten(2, (count, h))
+
+
+def agreeing(depth: Tensor, target: Views, photo_depth: Tensor, photos: Views, which: Tensor) -> Tensor:
+    """(N, M, H, W) bool: whether photo `which[n, m]` shows what target n does at each pixel: the place lies in its
+    image, at the depth that it has there.
+
+    depth (N, H, W) of the targets (N) and photo_depth (B, h, w) of the photos (B) are inverse, in the cameras' unit."""
+    at = project(pair_maps(target, photos[which]), depth[:, None])
+    there = take(photo_depth[which.flatten()][:, None], at.grid.flatten(0, 1), "nearest")
+    there, here = there.unflatten(0, which.shape)[:, :, 0, 0], at.inverse_depth[:, :, 0]
+    return at.valid[:, :, 0] & ((there - here).abs() < _SAME[0] * here + _SAME[1])

@@ -7,16 +7,22 @@ from collections.abc import Sequence
 import torch
 
 from cat3d_core.cameras import Cameras
+from cat3d_core.matching import warp
 from cat3d_core.matching.hint import observe, photo_depth
+from cat3d_core.matching.network import partners
 from cat3d_core.sample_sets import sample_cameras, source_boxes
 from flows.generation.hints import open_sweep
-from flows.generation.views import SPREAD, captured_sample
+from flows.generation.views import captured_sample
 from flows.jobs.access import read_cameras
 from flows.jobs.job import Job
 from schemas.scene_store import SceneStore
 
 #: Side of the samples that depths are found in: the largest that the network was trained with.
 SIDE = 128
+#: Expected error of an inverse depth, in 1 / scene unit, at which the trust in it has fallen to a third.
+SPREAD = 0.15
+#: Other photos that may confirm a photo's depth, the nearest.
+WITNESSES = 8
 
 
 def photos(store: SceneStore, views: Sequence[int], kind: str, side: int) -> tuple[torch.Tensor, Cameras]:
@@ -27,11 +33,18 @@ def photos(store: SceneStore, views: Sequence[int], kind: str, side: int) -> tup
 
 def photo_depths(job: Job, store: SceneStore, views: Sequence[int]) -> list[tuple[torch.Tensor, torch.Tensor]]:
     """Of each of these captured views, the z-depth of its pixels (H, W) in scene units, infinite far away, and the
-    trust in it (H, W) in [0, 1]: exp(-expected error of the inverse depth / SPREAD)."""
+    trust in it (H, W) in [0, 1]: exp(-expected error of the inverse depth / SPREAD), and 0 where none of the nearest
+    other photos shows the place at that depth (unless there is no other)."""
     size = read_cameras(store.captured, views).size
     kind = "square" if bool((size[:, 0] == size[:, 1]).all()) else "wide"  # which shows whole photos
     network = open_sweep(job)
-    inverse, error = photo_depth(network, observe(network, *photos(store, views, kind, SIDE)))
+    image, cameras = photos(store, views, kind, SIDE)
+    inverse, error = (part.cpu() for part in photo_depth(network, observe(network, image, cameras)))
+    trust = torch.exp(-error / SPREAD)
+    if len(views) > 1:
+        seen = warp.views(cameras)
+        others = partners(seen.pose, WITNESSES)
+        trust = trust * warp.agreeing(inverse, seen, inverse, seen, others).any(1)
     found = []
     boxes = source_boxes(size, kind).tolist()
     for index, ((width, height), (x0, y0, side)) in enumerate(zip(size.tolist(), boxes, strict=True)):
@@ -39,7 +52,7 @@ def photo_depths(job: Job, store: SceneStore, views: Sequence[int]) -> list[tupl
         scale = inverse.shape[-1] / side
         rows = ((torch.arange(height) + 0.5 - y0) * scale).long()[:, None]
         columns = ((torch.arange(width) + 0.5 - x0) * scale).long()
-        near, off = inverse[index].cpu()[rows, columns], error[index].cpu()[rows, columns]
+        near = inverse[index][rows, columns]
         depth = torch.where(near > 0, 1 / near.clamp_min(1e-6), torch.inf)
-        found.append((depth, torch.exp(-off / SPREAD)))
+        found.append((depth, trust[index][rows, columns]))
     return found

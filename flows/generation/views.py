@@ -12,14 +12,11 @@ from numpy.typing import NDArray
 from cat3d_core.cameras import Cameras
 from cat3d_core.generation import Generator
 from cat3d_core.sample_sets import source_boxes
-from flows.generation.hints import SAMPLE_CONFIDENCE, StoredHint, open_sweep, read_hint
+from flows.generation.hints import SAMPLE_CONFIDENCE, open_sweep, read_hint
 from flows.jobs.access import read_cameras
 from flows.jobs.job import Job
 from flows.media.images import square_image
 from schemas.scene_store import Run, SceneStore, Section
-
-#: Standard deviation of an inverse depth, in 1 / scene unit, at which the trust in it has fallen to a third.
-SPREAD = 0.15
 
 
 def captured_sample(store: SceneStore, view: int, kind: str, size: int) -> torch.Tensor:
@@ -63,13 +60,11 @@ def in_window(camera: Cameras, image: NDArray[np.uint8], window: list[int]) -> t
 
 class GeneratedView(NamedTuple):
     """A generated view's part that isn't padding: one camera, (h, w, 3) uint8 image; with hints also the trust in each
-    pixel (h, w), z-depth in scene units (infinite for the sky) and the trust in that."""
+    pixel (h, w)."""
 
     camera: Cameras
     image: torch.Tensor
     trust: torch.Tensor | None = None
-    depth: torch.Tensor | None = None
-    depth_trust: torch.Tensor | None = None
 
 
 def generated_views(run: Run) -> Iterator[GeneratedView]:
@@ -82,16 +77,5 @@ def generated_views(run: Run) -> Iterator[GeneratedView]:
         if not hinted:
             yield GeneratedView(camera, image)
             continue
-        hint = read_hint(run, view)
-        maps = (run.generated.read("confidence", [view])[0].astype(np.float32), *depth_of(hint))
-        yield GeneratedView(camera, image, *(in_window(cameras[i], np.asarray(m), window)[1] for m in maps))
-
-
-def depth_of(hint: StoredHint) -> tuple[torch.Tensor, torch.Tensor]:
-    """z-depth (H, W) in scene units, infinite where the inverse depth is 0, and the trust in it (H, W) in [0, 1].
-
-    The trust is the confidence of the colour, less where the depth is spread: exp(-spread / SPREAD).
-    """
-    inverse = hint.inverse_depth
-    depth = torch.where(inverse > 0, 1 / inverse.clamp_min(1e-6), torch.inf)
-    return depth, hint.confidence * torch.exp(-hint.spread / SPREAD)
+        trust = run.generated.read("confidence", [view])[0].astype(np.float32)
+        yield GeneratedView(camera, image, in_window(cameras[i], trust, window)[1])

@@ -61,10 +61,10 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
     if masks is not None:
         masks += [None] * (len(cameras) - len(train))
         decisions.append(skipped("Pixels outside the masks of captured views were not trained on."))
-    depths = photo_depths(job, store, train) if made and job.hinted else []
-    if depths:
-        decisions.append(chosen("The plane sweep's depths of captured and generated views guide the training."))
-    maps = hint_maps(len(train), made, depths)
+    maps = {}
+    if made and job.hinted:
+        maps = hint_maps(made, photo_depths(job, store, train))
+        decisions.append(chosen("The plane sweep's depths of the captured views guide the training."))
     images = chain(read_images(store.captured, train), (view.image for view in made))
     views = Views.from_images(cameras, images, captured, masks, **maps)
     kept, told = unseen(job, views)
@@ -78,18 +78,18 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
 
 
 def hint_maps(
-    captured: int, made: Sequence[GeneratedView], depths: Sequence[tuple[torch.Tensor, torch.Tensor]]
+    made: Sequence[GeneratedView], depths: Sequence[tuple[torch.Tensor, torch.Tensor]]
 ) -> dict[str, list[torch.Tensor | None]]:
-    """The trust in each pixel of generated views, and the depths of all, as `Views.from_images` takes them; captured
-    views are trusted wholly. depths: of captured views, with the trust in them; none: not known."""
-    if not depths and not any(view.trust is not None for view in made):
-        return {}
-    none: list[torch.Tensor | None] = [None] * captured
-    of_captured = [depth for depth, _ in depths] or none, [trust for _, trust in depths] or none
+    """The trust in each pixel of generated views and the depths of captured ones, as `Views.from_images` takes them.
+
+    Captured views are trusted wholly; depths are theirs, each with the trust in it. Those of generated views are not
+    used: no other view confirms them, and on captured scenes they cost 0.1 dB (docs/log/2026-11-29_depth.md)."""
+    known: list[torch.Tensor | None] = [None] * len(depths)
+    unknown: list[torch.Tensor | None] = [None] * len(made)
     return {
-        "weights": none + [view.trust for view in made],
-        "depths": [*of_captured[0], *(view.depth for view in made)],
-        "depth_weights": [*of_captured[1], *(view.depth_trust for view in made)],
+        "weights": known + [view.trust for view in made],
+        "depths": [depth for depth, _ in depths] + unknown,
+        "depth_weights": [trust for _, trust in depths] + unknown,
     }
 
 

@@ -51,4 +51,5 @@ def test_depths_of_a_scene_are_near_the_true_ones(tmp_path: Path) -> None:
         known = torch.from_numpy(truth[view]).float() * read_similarity(store).scale
         off = (1 / depth - 1 / known).abs()
         assert float(off.median()) < 0.06
-        assert float(off[trust > trust.median()].mean()) < float(off[trust < trust.median()].mean())
+        assert float((trust > 0).float().mean()) > 0.3
+        assert float(off[trust > 0].mean()) < float(off[trust == 0].mean()), "what no other photo confirms is worse"

@@ -26,7 +26,7 @@ def test_a_sweep_of_commit_0888913_is_not_redone(tmp_path: Path, monkeypatch: py
     with tarfile.open(FIXTURE) as archive:
         archive.extractall(tmp_path, filter="data")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(PRESETS, "fast", replace(PRESETS["fast"], multisamples=6, lr_final=0.001))
+    monkeypatch.setitem(PRESETS, "fast", replace(PRESETS["fast"], multisamples=6, lr_final=0.001, depth_prior=0.0))
     config = load_config(Path("sweep.yaml"), SweepConfig)
     out = Path("out").resolve()
     scenes, problems = sweep_jobs(config, out)
