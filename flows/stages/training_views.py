@@ -64,7 +64,8 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
     maps = {}
     if made and job.hinted:
         maps = hint_maps(made, photo_depths(job, store, train))
-        decisions.append(chosen("The plane sweep's depths of the captured views guide the training."))
+        text = "Depths of the captured views go with them: the plane sweep's, where another view confirms them."
+        decisions.append(chosen(text))
     images = chain(read_images(store.captured, train), (view.image for view in made))
     views = Views.from_images(cameras, images, captured, masks, **maps)
     kept, told = unseen(job, views)

@@ -93,7 +93,7 @@ def test_views_are_photos_where_they_show_the_place_and_samples_elsewhere(tmp_pa
     assert views.inverse_depth is not None
     assert views.inverse_depth_weight is not None
     assert float(views.map(views.inverse_depth_weight, 3).max()) == 0, "no depth of a generated view is used"
-    assert any("depths of the captured views guide" in d.text for d in decisions)
+    assert any("Depths of the captured views go with them" in d.text for d in decisions)
     assert bool((views.map(views.weight, 0) == 1).all())  # a captured view is trusted wholly
     assert float(views.map(views.weight, 3).max()) < 1
 

@@ -12,7 +12,7 @@ from cat3d_core.matching.checkpoint import describe_sweep, load_sweep
 from cat3d_core.random import generator
 from flows.commands.train import kind_of, train_command, training_config
 from flows.errors import InputError
-from flows.training.sweep import rate_at, shape_of, stage_at
+from flows.training.sweep import rate_at, shape_of, stage_at, starting_network
 from flows.training.sweep_batches import GeometryBank, batch
 from schemas.errors import ConfigError
 from schemas.sweep_training import SWEEP_TRAINING, SWEEP_VALIDATION, SweepRunConfig
@@ -45,6 +45,19 @@ def trained(settings: Path) -> Path:
     out = settings.parent / "whole"
     train_command(str(settings), out, {}, [], False)
     return out
+
+
+def test_weights_can_be_started_from_with_sharper_blending_and_nothing_else(trained: Path) -> None:
+    file = trained / "sweep.safetensors"
+    before = load_sweep(file)
+    network = starting_network(SweepRunConfig(start=file, network={"sharpness": [8.0, 3.0]}))
+    assert network.config.sharpness == (8.0, 3.0)
+    assert network.config.photo_planes == before.config.photo_planes
+    assert all(torch.equal(a, b) for a, b in zip(network.parameters(), before.parameters(), strict=True))
+    with pytest.raises(ConfigError, match="holds another network"):
+        starting_network(SweepRunConfig(start=file, network={"photo_planes": 16}))
+    with pytest.raises(ConfigError, match="network: .*sharpnes"):
+        starting_network(SweepRunConfig(start=file, network={"sharpnes": [1.0, 1.0]}))
 
 
 def test_a_training_leaves_weights_and_tables(trained: Path) -> None:
