@@ -76,11 +76,15 @@ def panels_of(name: str, rows: list[Row]) -> list[Drawn]:
 
 
 def worth_showing(rows: list[Row], panels: list[Drawn]) -> list[Row]:
-    """All rows if they fit on a page, else those on the fronts and the defaults."""
+    """All rows if they fit on a page, else those on the fronts and the defaults, and those that no picture shows if
+    they fit."""
     if len(rows) <= MOST_ROWS or not panels:
         return rows
-    chosen = [row for drawn in panels for row in (*drawn.front, *drawn.defaults)]
-    return [row for row in rows if any(row is one for one in chosen)]
+    drawn = {id(row) for panel in panels for row in panel.rows}
+    chosen = {id(row) for panel in panels for row in (*panel.front, *panel.defaults)}
+    others = {id(row) for row in rows} - drawn
+    chosen |= others if len(others) <= MOST_ROWS else set()
+    return [row for row in rows if id(row) in chosen]
 
 
 def tables(rows: list[Row]) -> list[tuple[Row, list[str], list[Row]]]:
