@@ -34,17 +34,15 @@ def photos(store: SceneStore, views: Sequence[int], kind: str, side: int) -> tup
 def photo_depths(job: Job, store: SceneStore, views: Sequence[int]) -> list[tuple[torch.Tensor, torch.Tensor]]:
     """Of each of these captured views, the z-depth of its pixels (H, W) in scene units, infinite far away, and the
     trust in it (H, W) in [0, 1]: exp(-expected error of the inverse depth / SPREAD), and 0 where none of the nearest
-    other photos shows the place at that depth (unless there is no other)."""
+    other views shows the place at that depth."""
     size = read_cameras(store.captured, views).size
     kind = "square" if bool((size[:, 0] == size[:, 1]).all()) else "wide"  # which shows whole photos
     network = open_sweep(job)
     image, cameras = photos(store, views, kind, SIDE)
     inverse, error = (part.cpu() for part in photo_depth(network, observe(network, image, cameras)))
-    trust = torch.exp(-error / SPREAD)
-    if len(views) > 1:
-        seen = warp.views(cameras)
-        others = partners(seen.pose, WITNESSES)
-        trust = trust * warp.agreeing(inverse, seen, inverse, seen, others).any(1)
+    seen = warp.views(cameras)
+    confirmed = warp.agreeing(inverse, seen, inverse, seen, partners(seen.pose, WITNESSES)).any(1)
+    trust = torch.exp(-error / SPREAD) * confirmed
     found = []
     boxes = source_boxes(size, kind).tolist()
     for index, ((width, height), (x0, y0, side)) in enumerate(zip(size.tolist(), boxes, strict=True)):

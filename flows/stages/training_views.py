@@ -26,6 +26,9 @@ ENOUGH = 0.5
 #: Up to so many captured views generated ones are always trained on: what two of so few show, they show badly.
 FEW = 3
 
+#: A view's z-depths (H, W), and the trust in them.
+Known = tuple[torch.Tensor | None, torch.Tensor | None]
+
 
 def enough(captured: int) -> float | None:
     """ENOUGH where that rule holds for so many captured views, else None."""
@@ -63,9 +66,12 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
         decisions.append(skipped("Pixels outside the masks of captured views were not trained on."))
     maps = {}
     if made and job.hinted:
-        maps = hint_maps(made, photo_depths(job, store, train))
-        text = "Depths of the captured views go with them: the plane sweep's, where another view confirms them."
-        decisions.append(chosen(text))
+        depths: list[Known] = [(None, None)] * len(train)
+        if len(train) > 1:  # a single one's depth is a guess, and costs 0.1 dB
+            depths = list(photo_depths(job, store, train))
+            text = "Depths of the captured views go with them: the plane sweep's, where another view confirms them."
+            decisions.append(chosen(text))
+        maps = hint_maps(made, depths)
     images = chain(read_images(store.captured, train), (view.image for view in made))
     views = Views.from_images(cameras, images, captured, masks, **maps)
     kept, told = unseen(job, views)
@@ -78,13 +84,11 @@ def training_views(job: Job, store: SceneStore, run: Run) -> tuple[Views, list[D
     return alone, [*decisions, told]
 
 
-def hint_maps(
-    made: Sequence[GeneratedView], depths: Sequence[tuple[torch.Tensor, torch.Tensor]]
-) -> dict[str, list[torch.Tensor | None]]:
+def hint_maps(made: Sequence[GeneratedView], depths: Sequence[Known]) -> dict[str, list[torch.Tensor | None]]:
     """The trust in each pixel of generated views and the depths of captured ones, as `Views.from_images` takes them.
 
-    Captured views are trusted wholly; depths are theirs, each with the trust in it. Those of generated views are not
-    used: no other view confirms them, and on captured scenes they cost 0.1 dB (docs/log/2026-11-29_depth.md)."""
+    Captured views are trusted wholly; depths are theirs, each with the trust in it, or none. Those of generated views
+    are not used: no photo confirms them, and on captured scenes they cost 0.1 dB (docs/log/2026-11-29_depth.md)."""
     known: list[torch.Tensor | None] = [None] * len(depths)
     unknown: list[torch.Tensor | None] = [None] * len(made)
     return {

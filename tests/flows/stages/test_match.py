@@ -142,6 +142,9 @@ def test_anchors_of_a_single_photo_are_always_sampled(tmp_path: Path, model: Pat
     assert anchors.any()
     assert not explained_views(one, run)[anchors].any()
     assert run.generated.read("done_latent").any(-1)[anchors].all()
+    views, decisions = training_views(one, SceneStore.open(one.store_path), run)
+    assert views.inverse_depth_weight is None or not views.inverse_depth_weight.any(), "nothing confirms its depth"
+    assert not any("Depths of the captured views" in d.text for d in decisions)
 
 
 def test_an_interrupted_match_makes_what_is_missing(tmp_path: Path, model: Path, monkeypatch) -> None:
