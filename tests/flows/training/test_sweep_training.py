@@ -50,14 +50,14 @@ def trained(settings: Path) -> Path:
 def test_weights_can_be_started_from_with_sharper_blending_and_nothing_else(trained: Path) -> None:
     file = trained / "sweep.safetensors"
     before = load_sweep(file)
-    network = starting_network(SweepRunConfig(start=file, network={"sharpness": [8.0, 3.0]}))
+    network = starting_network(SweepRunConfig(start=file, steps=1, network={"sharpness": [8.0, 3.0]}))
     assert network.config.sharpness == (8.0, 3.0)
     assert network.config.photo_planes == before.config.photo_planes
     assert all(torch.equal(a, b) for a, b in zip(network.parameters(), before.parameters(), strict=True))
     with pytest.raises(ConfigError, match="holds another network"):
-        starting_network(SweepRunConfig(start=file, network={"photo_planes": 16}))
+        starting_network(SweepRunConfig(start=file, steps=1, network={"photo_planes": 16}))
     with pytest.raises(ConfigError, match="network: .*sharpnes"):
-        starting_network(SweepRunConfig(start=file, network={"sharpnes": [1.0, 1.0]}))
+        starting_network(SweepRunConfig(start=file, steps=1, network={"sharpnes": [1.0, 1.0]}))
 
 
 def test_a_training_leaves_weights_and_tables(trained: Path) -> None:
