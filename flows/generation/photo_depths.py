@@ -14,6 +14,7 @@ from cat3d_core.sample_sets import sample_cameras, source_boxes
 from flows.generation.hints import open_sweep
 from flows.generation.views import captured_sample
 from flows.jobs.access import read_cameras
+from flows.jobs.device import cpu_threads
 from flows.jobs.job import Job
 from schemas.scene_store import SceneStore
 
@@ -39,7 +40,8 @@ def photo_depths(job: Job, store: SceneStore, views: Sequence[int]) -> list[tupl
     kind = "square" if bool((size[:, 0] == size[:, 1]).all()) else "wide"  # which shows whole photos
     network = open_sweep(job)
     image, cameras = photos(store, views, kind, SIDE)
-    inverse, error = (part.cpu() for part in photo_depth(network, observe(network, image, cameras)))
+    with cpu_threads(job.config.execution.threads):
+        inverse, error = (part.cpu() for part in photo_depth(network, observe(network, image, cameras)))
     seen = warp.views(cameras)
     confirmed = warp.agreeing(inverse, seen, inverse, seen, partners(seen.pose, WITNESSES)).any(1)
     trust = torch.exp(-error / SPREAD) * confirmed
