@@ -45,6 +45,8 @@ def flat_maps(
     if len(maps) != len(shapes):
         raise ValueError(f"There are {len(maps)} {what}s for {len(shapes)} images.")
     device = next((values.device for values in maps if values is not None), None)
+    if device is None:
+        return None
     flat = torch.full((sum(shape.numel() for shape in shapes),), missing, dtype=dtype, device=device)
     parts = flat.split([shape.numel() for shape in shapes])
     for index, (values, part, shape) in enumerate(zip(maps, parts, shapes, strict=True)):

@@ -182,7 +182,8 @@ _FAST = replace(
     # The shipped model blurs: 3 photos and 24 generated views of five procedural scenes gave 23.5 dB with half of the
     # rays from the photos, 22.5 dB with a tenth.
     captured_share=0.5,
-    # Eight procedural scenes, three photos and 24 generated views: +0.7 dB at 0.1 and at 0.3.
+    # With the photos' confirmed depths, three photos: +0.35 dB on eight procedural scenes, +0.13 on seven captured ones
+    # (docs/log/2026-11-29_depth.md).
     depth_prior=0.1,
     samples=(32, 16),
     grid_max=(128, 1024),

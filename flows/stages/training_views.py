@@ -99,17 +99,17 @@ def hint_maps(made: Sequence[GeneratedView], depths: Sequence[Known]) -> dict[st
 
 
 def no_finer(view: GeneratedView, focal: float) -> GeneratedView:
-    """A view, reduced where its focal length in pixels is longer than `focal`. Its maps take the nearest pixel: a mean
-    of depths before and behind an edge is the depth of nothing."""
+    """A view, reduced where its focal length in pixels is longer than `focal`; the trust is that of the nearest
+    pixel."""
     scale = focal / float(view.camera.intrinsics[0, 0, 0])
     if scale >= 1:
         return view
     width, height = (max(1, round(side * scale)) for side in view.camera.size[0].tolist())
-    maps = (m if m is None else functional.interpolate(m[None, None], (height, width), mode="nearest-exact")[0, 0]
-            for m in view[2:])  # fmt: skip
-    return GeneratedView(
-        view.camera.resize(width, height), torch.from_numpy(resize(view.image.numpy(), width, height)), *maps
-    )
+    trust = view.trust
+    if trust is not None:
+        trust = functional.interpolate(trust[None, None], (height, width), mode="nearest-exact")[0, 0]
+    image = torch.from_numpy(resize(view.image.numpy(), width, height))
+    return GeneratedView(view.camera.resize(width, height), image, trust)
 
 
 def unseen(job: Job, views: Views) -> tuple[torch.Tensor | None, Decision | None]:

@@ -10,6 +10,8 @@ from __future__ import annotations
 from flows.bench.peers.task import Curve, Row, Task, answer
 
 # isort: split
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -28,8 +30,6 @@ def measure(task: Task) -> list[Row]:
     from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
     from nerfstudio.engine.optimizers import AdamOptimizerConfig
     from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
-    from nerfstudio.models import nerfacto
-    from torchmetrics.image import lpip
 
     def cameras(role: str) -> Cameras:
         poses = torch.from_numpy(task.arrays[f"{role}_cameras"]).float()[:, :3]
@@ -40,16 +40,9 @@ def measure(task: Task) -> list[Row]:
 
     train, test = cameras("train"), cameras("test")
     images = torch.from_numpy(task.arrays["train_images"]).float() / 255
-    # Its LPIPS, which only its own evaluation uses, would fetch weights.
-    vars(lpip)["LearnedPerceptualImagePatchSimilarity"] = lambda **_: torch.nn.Identity()
-    # What its table of methods has for nerfacto; that table itself imports every method it knows.
-    config = nerfacto.NerfactoModelConfig(
-        eval_num_rays_per_chunk=RENDERED_AT_ONCE, average_init_density=0.01, implementation="torch"
-    )
-    config.camera_optimizer.mode = "off"
     decay = ExponentialDecaySchedulerConfig(lr_final=1e-4, max_steps=200_000)
     box = SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
-    model = config.setup(scene_box=box, num_train_data=len(images), metadata={}, device="cpu", grad_scaler=None)
+    model = untrained(box, len(images))
     optimisers, schedules = [], []
     for name, parameters in model.get_param_groups().items():
         if name in ("proposal_networks", "fields"):
@@ -97,6 +90,21 @@ def measure(task: Task) -> list[Row]:
             at_step += 1
         curve.point(at_step, render, rays_per_s=at_step * rays / curve.seconds)
     return curve.rows
+
+
+def untrained(box: Any, views: int) -> Any:
+    """Its model in torch alone, for the scene box of so many training views whose cameras stay as they are."""
+    from nerfstudio.models import nerfacto
+    from torchmetrics.image import lpip
+
+    # Its LPIPS, which only its own evaluation uses, would fetch weights.
+    vars(lpip)["LearnedPerceptualImagePatchSimilarity"] = lambda **_: torch.nn.Identity()
+    # What its table of methods has for nerfacto; that table itself imports every method it knows.
+    config = nerfacto.NerfactoModelConfig(
+        eval_num_rays_per_chunk=RENDERED_AT_ONCE, average_init_density=0.01, implementation="torch"
+    )
+    config.camera_optimizer.mode = "off"
+    return config.setup(scene_box=box, num_train_data=views, metadata={}, device="cpu", grad_scaler=None)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import torch
 
+from flows.bench.peers.nerfacto import untrained
 from flows.bench.peers.torchvision_cpu import allow_torchvision
 
 
@@ -40,19 +41,13 @@ def measure(task: Task) -> list[Row]:
 def _begun(task: Task) -> Row:
     from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-    from nerfstudio.models import nerfacto
-    from torchmetrics.image import lpip
 
-    # Its LPIPS, which only its own evaluation uses, would fetch weights.
-    vars(lpip)["LearnedPerceptualImagePatchSimilarity"] = lambda **_: torch.nn.Identity()
     reader = NerfstudioDataParserConfig(data=Path(task.settings["photos"]))
     loader: VanillaDataManager = VanillaDataManagerConfig(
         dataparser=reader, train_num_rays_per_batch=task.settings["rays"]
     ).setup(device="cpu")
-    config = nerfacto.NerfactoModelConfig(average_init_density=0.01, implementation="torch")
-    config.camera_optimizer.mode = "off"
-    box, count = loader.train_dataset.scene_box, len(loader.train_dataset)
-    model = config.setup(scene_box=box, num_train_data=count, metadata={}, device="cpu", grad_scaler=None)
+    count = len(loader.train_dataset)
+    model = untrained(loader.train_dataset.scene_box, count)
     parameters = [p for group in model.get_param_groups().values() for p in group]
     optimiser = torch.optim.Adam(parameters, lr=1e-2, eps=1e-15)
     model.train()

@@ -31,6 +31,12 @@ def test_without_maps_every_pixel_weighs_one_and_no_depth_is_known() -> None:
     assert batch.inverse_depth is batch.inverse_depth_weight is None
 
 
+def test_maps_of_no_view_are_no_maps() -> None:
+    none: list[torch.Tensor | None] = [None, None]
+    views = random_views(masks=none, weights=none, depths=none, depth_weights=none)
+    assert views.valid is views.weight is views.inverse_depth is views.inverse_depth_weight is None
+
+
 def test_a_weight_reaches_its_pixel_and_zero_is_never_drawn() -> None:
     weight = torch.linspace(0, 1, 15).view(3, 5)
     weight[1] = 0
